@@ -91,18 +91,22 @@ pub trait Physics: Send {
     fn kind(&self) -> Kind;
     /// Returns the name and serial number of the machine, at most 32 ASCII characters.
     fn name(&self) -> String;
-    /// Checks a payload after its arrival, before the machine uses it. `kind` is its number in docs/modbus.md: 1 plan,
-    /// 2 map, 3 pass.
+    /// Checks a payload after its arrival, before the machine uses it. `kind` is the number of the payload's kind in
+    /// docs/modbus.md: 1 plan, 2 map, 3 pass.
     ///
     /// # Errors
-    /// The payload is broken, of another part, or beyond the limits of the machine.
+    /// Returns a refusal if the bytes of the payload are invalid, if the payload is for a different part, or if a value
+    /// exceeds the limits of the machine.
     fn check(&self, kind: u16, payload: &Payload) -> Result<(), Refusal>;
     /// Prepares cycle number `cycle` of the job `job`, without motion. `payloads` are the payloads in force: the
     /// checked plan, map or pass that the machine stores. Returns the progress before the start.
     ///
     /// # Errors
-    /// Returns a refusal if a payload is missing or exceeds the limits of the machine, if the payloads are for
-    /// different parts, or if the other machine has the part.
+    /// Returns a refusal in these cases:
+    ///
+    /// - A payload is missing or exceeds the limits of the machine.
+    /// - The payloads are for different parts.
+    /// - The part is in the other machine of the cell (the CMM or the grinder).
     fn prepare(&mut self, job: u32, cycle: u16, payloads: &Payloads) -> Result<Progress, Refusal>;
     /// Begins to carry out the prepared job.
     fn begin(&mut self);
@@ -111,8 +115,8 @@ pub trait Physics: Send {
     /// Moves the wheel or the probe clear of the part. The job can then continue with [`Physics::advance`] or end with
     /// [`Physics::end_job`].
     fn retract(&mut self);
-    /// Returns true if this kind of machine can return a part of its result while a job runs, through
-    /// [`Physics::partial_result`]. The default is false.
+    /// Returns true if this kind of machine can return the finished records of its result while the job still runs.
+    /// [`Physics::partial_result`] returns these records, for example the points measured so far. The default is false.
     fn has_partial_result(&self) -> bool {
         false
     }
@@ -123,8 +127,9 @@ pub trait Physics: Send {
     }
     /// Ends the job as complete (1), stopped (2), aborted (3) or failed (4), and returns its result.
     fn end_job(&mut self, result: u16) -> ResultData;
-    /// Returns the interlock bits of the machine, numbered as in docs/modbus.md. A bit is 1 if the interlock is closed
-    /// (good). Bit 1 means that the wheel or the probe is clear of the part.
+    /// Returns the interlocks of the machine as bits, numbered from 0 as in docs/modbus.md. A bit is 1 if its interlock
+    /// is closed (good). The bit number 1 is the interlock "clear of the part": it is closed if the wheel or the probe
+    /// is clear of the part.
     fn interlocks(&self) -> u16;
     /// Returns the temperature in °C that the machine reports in its status block.
     fn temperature_c(&self) -> f64;

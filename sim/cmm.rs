@@ -65,9 +65,12 @@ impl CmmSpec {
     }
 }
 
-/// Returns the straight path of the probe's centre to `target`, in the machine's frame. `radius_mm` is the true radius
-/// of the probe ball. The path begins and ends at distances that are computed with the radius stated in `plan`, because
-/// the machine does not know the true radius.
+/// Returns the straight path on which the centre of the probe ball approaches `target`, in the machine's frame. The
+/// path follows the normal of `target`, from the start of the search to its end. `radius_mm` is the true radius of the
+/// ball.
+///
+/// The machine does not know the true radius. The distances of the start and the end from the target are therefore
+/// computed with the radius stated in `plan`.
 fn approach_to(target: &Target, plan: &Plan, radius_mm: f64) -> Approach {
     Approach {
         point_mm: target.point_mm,
@@ -129,9 +132,11 @@ impl Run {
         self.not_found = draw(Source::NotFound);
     }
 
-    /// Returns one time in s for each target of `plan`: the time from the start of the job to the end of the touch. The
-    /// times include the travel between targets. The plan can require a slower speed for its first targets; their
-    /// touches take longer in proportion.
+    /// Returns, for each target of `plan`, the time in s from the start of the job to the end of the touch of this
+    /// target. The times include the travel between targets.
+    ///
+    /// `plan.careful` can set a slower speed for a number of targets at the start of the plan. The duration of each of
+    /// these touches is multiplied by the ratio of the normal speed to the slower speed.
     fn due_s(plan: &Plan, spec: &CmmSpec) -> Vec<f64> {
         let (slowly, speed_mm_s) = plan.careful;
         let each_s = |k: usize| {
@@ -318,9 +323,12 @@ impl TouchProbe {
     /// the machine's frame. The ball moves against the normal. The array holds the radius of the probe, the approach
     /// distance and the search distance, in mm.
     ///
-    /// Returns the centre of the ball in mm, or the reason why there is none. Returns `TouchResult::Unexpected` if the
-    /// grinder has the part or the state of the part is unknown. If the part has left the CMM since the last touch,
-    /// this touch begins a new measurement with a new random placement.
+    /// Returns `TouchResult::Centre` with the centre of the ball in mm. Returns `TouchResult::Missed` if the ball finds
+    /// no surface. Returns `TouchResult::Unexpected` if the ball touches before the search begins, if the part is in
+    /// the grinder, or if the state of the part is unknown.
+    ///
+    /// If the part has left the CMM since the last touch, this touch begins a new measurement with a new random
+    /// placement.
     pub fn touch(
         &mut self,
         point_mm: Vec3,
@@ -494,7 +502,7 @@ impl Physics for Cmm {
 }
 
 impl Drop for Cmm {
-    /// Releases the part, so that the grinder can take it.
+    /// Releases the part when this CMM object is destroyed. The grinder can then take the part.
     fn drop(&mut self) {
         locked(&self.world).release(Kind::Cmm);
     }

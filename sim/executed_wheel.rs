@@ -143,8 +143,8 @@ impl Wheel {
     }
 
     /// Grinds the waiting track (the last track that has ended but is not yet ground) as the last track of the pass.
-    /// Normally, a track is ground only after the next track has ended, because its width depends on the next track.
-    /// Does nothing if no track waits, or if the wheel is at the part and the next track has begun.
+    /// Normally, a track waits until the next track has ended, because the width of its strip depends on the next
+    /// track. Does nothing if no track waits, or if the wheel has already begun the next track on the part.
     pub fn finish_waiting_track(&mut self) {
         let world = Arc::clone(&self.world);
         let state = &mut *locked(&world);
@@ -153,13 +153,16 @@ impl Wheel {
         }
     }
 
-    /// Projects the wheel's centre onto the nominal surface. Returns the position, and the height in mm over the
-    /// nominal surface that the wheel would leave. The centre includes the lag of the axes and the radius error of the
-    /// grinder.
+    /// Projects the true centre of the wheel onto the nominal surface. The true centre is the commanded centre,
+    /// corrected for the lag of the axes and for the radius error of the wheel. `from_mm` and `place_mm` are the
+    /// previous and the present commanded centre in mm. `then` and `seconds` are the times of these two positions in s.
     ///
-    /// `from_mm` and `place_mm` are the previous and the present commanded position in mm. `then` and `seconds` are the
-    /// times of these positions in s. Returns `None` if the wheel is 1 mm or more above the real surface, or if the
-    /// projection fails.
+    /// Returns the position (x, y) of the projection in mm, the height in mm over the nominal surface that the wheel
+    /// would leave there, and the time `seconds`. Returns `None` if the wheel is 1 mm or more above the real surface,
+    /// or if the projection fails.
+    ///
+    /// If the wheel is more than 2 mm below the real surface inside the aperture, also marks the state of the part as
+    /// unknown.
     fn project(
         &mut self,
         state: &mut WorldState,
@@ -238,8 +241,8 @@ impl Wheel {
     }
 
     /// Ends the present track after the wheel has lifted off or turned back. Grinds the waiting track (the track before
-    /// the present one). The present track then waits until the next track ends, because its width depends on the next
-    /// track. Ignores a present track with fewer than two positions, or with no position near the part.
+    /// the present one). The present track then waits until the next track ends, because the width of its strip depends
+    /// on the next track. Ignores the present track if the wheel has not moved along x near the part.
     fn end_track(&mut self, state: &mut WorldState) {
         let feet = std::mem::take(&mut self.projections);
         let [half_x, half_y] = state.part.aperture.half_mm();
@@ -304,10 +307,12 @@ fn bend(spec: &WorldSpec, part: &Part, radius_mm: f64) -> Option<HeightGrid> {
     })
 }
 
-/// Sets the positions of the part's grooves to the tracks of this pass. The positions follow from the first track of
-/// `pass` and from `track`. `half_mm` is half the distance between two tracks. If `half_mm` is `None`, nothing changes.
-/// If the specification has no grooves, the part has none afterwards. Where this pass has not ground, the grooves keep
-/// their previous height.
+/// Updates the position and the spacing of the part's grooves after a track. The first groove is at the first track of
+/// `pass`. The spacing is such that one of the grooves is at `track`. `half_mm` is half the distance between two
+/// tracks, in mm. Does nothing if `half_mm` is `None`.
+///
+/// This function does not change the curvature of existing grooves. If the specification has no grooves, the part has
+/// none afterwards.
 fn update_grooves(state: &mut WorldState, pass: &PassState, track: &Track, half_mm: Option<f64>) {
     let (Some(half), Some(first_mm)) = (half_mm, pass.first_mm) else { return };
     let number = ((track.y_mm - first_mm) / (2.0 * half)).round();

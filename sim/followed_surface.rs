@@ -18,18 +18,22 @@ struct BallSample {
     height_mm: f64,
 }
 
-/// Returns, for every node of a part, the height in mm over the nominal surface that a ball of radius `radius_mm`
-/// leaves when it follows a program. The height is NaN where the ball does not come. `track_mm` is the distance between
-/// neighbouring tracks.
+/// Simulates a ball of radius `radius_mm` (the wheel) that follows `program`. Returns, for every grid node of `part`,
+/// the height in mm over the nominal surface that the ball leaves. `track_mm` is the distance between neighbouring
+/// tracks. A node outside the part gets the height at the edge. The height is NaN at a node that the ball does not come
+/// near.
 pub(crate) fn heights_mm(part: &Part, program: &Program, radius_mm: f64, track_mm: f64) -> Vec<f64> {
     let reach_mm = (1.6 * track_mm).max(2.0 * SAMPLE_SPACING_MM);
     let cells = SampleIndex::new(touches(part, program, radius_mm), reach_mm);
     part.height.nodes().map(|at| cells.level_mm(on_part(part, at))).collect()
 }
 
-/// Returns the position `at_mm` (x, y) unchanged if it is on the part. For a position outside, returns the point at
-/// which the line from the origin to this position crosses the edge of the part. Nodes outside thus get the height of
-/// the edge, because the wheel has lifted off there.
+/// Returns the position on the part at which the height of a node is computed. `at_mm` is the position (x, y) of the
+/// node in mm. If `at_mm` is on the part, returns `at_mm` unchanged. Otherwise returns the point at which the line from
+/// the origin to `at_mm` crosses the edge of the part.
+///
+/// The wheel lifts off outside the part, so the path has no useful height there. If the origin itself is not on the
+/// part, returns `at_mm` unchanged.
 fn on_part(part: &Part, at_mm: [f64; 2]) -> [f64; 2] {
     let at = |share: f64| at_mm.map(|v| share * v);
     let is_on = |share: f64| part.aperture.contains(at(share)[0], at(share)[1]);
@@ -84,9 +88,10 @@ impl SampleIndex {
         at_mm.map(|v| (v / self.reach_mm).floor() as i64)
     }
 
-    /// Returns the height in mm over the nominal surface at the position `at_mm` (x, y). Fits a plane to the samples of
-    /// the ball near this position, by weighted least squares. The weight of a sample falls to 0 at the distance
-    /// `reach_mm`. Returns NaN if there is no sample within this distance.
+    /// Returns the height in mm over the nominal surface that the ball leaves at the position `at_mm` (x, y). Each
+    /// sample is a position of the ball, projected onto the nominal surface, with its height. Fits a plane to the
+    /// samples near `at_mm`, by weighted least squares. The weight of a sample falls to 0 at the distance
+    /// `self.reach_mm`. Returns NaN if there is no sample within this distance.
     fn level_mm(&self, at_mm: [f64; 2]) -> f64 {
         let [i, j] = self.cell(at_mm);
         // Normal equations of h = c0 + c1 u + c2 v.
@@ -108,7 +113,8 @@ impl SampleIndex {
     }
 }
 
-/// Returns the first unknown of three linear equations `m` x = `b`, by Cramer's rule; NaN if the system is singular.
+/// Solves the three linear equations `m` x = `b` by Cramer's rule, and returns only the first component of x. `m` is
+/// the matrix by rows, and `b` is the right side. The result is not finite if the matrix is singular.
 fn solve_first(m: [[f64; 3]; 3], b: [f64; 3]) -> f64 {
     let of = |c: [f64; 3]| {
         c[0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (c[1] * m[2][2] - m[1][2] * c[2])

@@ -229,8 +229,9 @@ pub(crate) fn cut(state: &mut WorldState, node: usize, cmd_mm: f64, bend: Option
     true
 }
 
-/// Returns `record` with the one value falsified that the configured fault `misreported` names, for example the path
-/// length. Returns `record` unchanged for `Nothing` and `Duration`.
+/// Returns `record` with one false value, to simulate a fault. `misreported` selects the value, for example the path
+/// length. Returns `record` unchanged for `Misreported::Nothing`. Also returns `record` unchanged for
+/// `Misreported::Duration`, because the duration is not part of a pass record.
 fn misreporting(record: PassRecord, misreported: Misreported) -> PassRecord {
     match misreported {
         Misreported::Nothing | Misreported::Duration => record,
@@ -296,8 +297,8 @@ fn fixed_mm(state: &WorldState, map: &Map, pass: &Pass, program: Option<&Program
     steered
 }
 
-/// Returns the true radius of the wheel in mm. If no earlier pass has fixed it, this is the radius that the pass
-/// states, plus the error in the specification.
+/// Returns the true radius of the wheel in mm. If `state` already contains the true radius from an earlier pass,
+/// returns this radius. Otherwise returns the radius stated in `pass` plus the radius error of the specification.
 fn true_radius_mm(state: &WorldState, pass: &Pass) -> f64 {
     state.true_wheel_radius_mm.unwrap_or(pass.wheel_radius_mm + 1e-3 * state.spec.grinder.wheel_radius_error_um)
 }
@@ -374,8 +375,10 @@ impl Grinder {
         Self { world, programs: None, ready: None, running: None }
     }
 
-    /// Makes the grinder follow the program in a folder that belongs to the map of the pass. `programs` names the
-    /// folder and the control. Without this call, the grinder uses the map itself.
+    /// Makes the grinder follow machine programs instead of correction maps. For each pass, the grinder then reads the
+    /// program whose comment contains the SHA-256 of the pass's map. `programs` states the folder of the programs, the
+    /// numerical control that reads them, and the rotary head of the machine. Without this call, the grinder applies
+    /// the map directly. Returns the changed grinder.
     #[must_use]
     pub fn by_programs(mut self, programs: Programs) -> Self {
         self.programs = Some(programs);
@@ -427,8 +430,9 @@ impl Grinder {
     }
 }
 
-/// Returns the strokes of a pass and their total duration in s: `roughing` roughing strokes, one finishing stroke, then
-/// the spark-out strokes. `stroke_mm` is the length of the path of one stroke.
+/// Returns the strokes of a pass and their total duration in s. A stroke is one run of the wheel along the whole path.
+/// The order is: `roughing` roughing strokes, one finishing stroke, then the spark-out strokes. `stroke_mm` is the
+/// length of the path of one stroke.
 fn strokes(roughing: u32, pass: &Pass, stroke_mm: f64) -> (Vec<Stroke>, f64) {
     let feed_mm_s = pass.feed_mm_min / 60.0;
     let above = (1..=roughing).rev().map(|k| Some(f64::from(k) * pass.depth_of_cut_mm));
@@ -651,7 +655,7 @@ impl Physics for Grinder {
 }
 
 impl Drop for Grinder {
-    /// Releases the part, so that the CMM can take it.
+    /// Releases the part when this grinder object is destroyed. The CMM can then take the part.
     fn drop(&mut self) {
         locked(&self.world).release(Kind::Grinder);
     }

@@ -300,7 +300,8 @@ impl Handshake {
     }
 
     /// Moves the wheel or the probe clear of the part, and enters the state `acting`: HOLDING, STOPPING or ABORTING.
-    /// The machine leaves this state by itself after a fixed time. The token of PREPARE becomes invalid.
+    /// The machine leaves this state by itself after a fixed time. The token (the random number that PREPARE gives and
+    /// START must repeat) becomes invalid.
     fn retract(&mut self, acting: State) {
         self.token = 0;
         self.acting_left = self.acting;
@@ -363,8 +364,9 @@ impl Handshake {
         Origin { job: self.job.job, cycle: self.job.cycle, done: self.done, identity }
     }
 
-    /// Returns true if a client can read the complete pages of a result while the job still runs. The option of the
-    /// simulator and the kind of machine must both allow this.
+    /// Returns true if a client can read the complete pages of a result (blocks of registers with result data) while
+    /// the job still runs. Two conditions must hold. The option `gives_ahead` of the simulator is set, and this kind of
+    /// machine has partial results.
     pub(crate) fn gives_ahead(&self) -> bool {
         self.gives_ahead && self.body.has_partial_result()
     }
@@ -521,8 +523,9 @@ impl Handshake {
         self.spoils = true;
     }
 
-    /// Handles a read of the payloads in force (the registers that show the stored payloads) by a client. If the fault
-    /// of [`Self::spoil`] is due, changes the SHA-256 identities of all stored payloads. Otherwise nothing happens.
+    /// Handles the event that a client has read the registers of the payloads in force (the stored payloads that the
+    /// machine uses). If a fault requested by [`Self::spoil`] is due, changes the SHA-256 identities of all stored
+    /// payloads. The fault is due if a payload was accepted after the request. Otherwise nothing happens.
     pub(crate) fn slots_were_read(&mut self) {
         if !std::mem::take(&mut self.spoils_soon) {
             return;

@@ -26,9 +26,12 @@ pub struct Head {
 }
 
 impl Head {
-    /// Returns the centre of the wheel in mm. `slides_mm` is the position of the slides. `scale_deg` is the angle in
-    /// degrees on the scale of the head. If `pivot_mm` is `None`, the control itself compensates the rotation, and the
-    /// centre is at `slides_mm`.
+    /// Returns the centre of the wheel in mm after the head has turned about its pivot. `slides_mm` is the position of
+    /// the linear slides; with the head upright, this is the centre of the wheel. `scale_deg` is the angle in degrees
+    /// on the scale of the head.
+    ///
+    /// The field `pivot_mm` of the head is the vector from the wheel's centre to the pivot with the head upright. If
+    /// `pivot_mm` is `None`, the control itself compensates the rotation, and the centre is at `slides_mm`.
     pub fn centre_mm(&self, slides_mm: Vec3, scale_deg: f64) -> Vec3 {
         let Some([u, v, w]) = self.pivot_mm else { return slides_mm };
         let angle = if self.left_handed { -scale_deg } else { scale_deg }.to_radians();

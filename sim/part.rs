@@ -202,7 +202,7 @@ pub enum Aperture {
 }
 
 impl Aperture {
-    /// Returns half the width and half the depth of the bounding rectangle, in mm.
+    /// Returns half the width (along x) and half the depth (along y) of the bounding rectangle of the aperture, in mm.
     pub fn half_mm(&self) -> [f64; 2] {
         match *self {
             Self::Rectangle { half_x_mm, half_y_mm } => [half_x_mm, half_y_mm],
@@ -332,10 +332,15 @@ pub struct Grooves {
 }
 
 impl Grooves {
-    /// Returns the curvature in 1/mm of the groove that the wheel leaves at (x, y). This is the curvature of the wheel
-    /// minus the curvature of the part, across the tracks. The tracks run along x. Across the tracks, the gap between
-    /// wheel and part counts at its minimum along x. Returns 0 where the wheel leaves no groove, for example in a
-    /// hollow that is narrower than the wheel.
+    /// Returns the curvature in 1/mm, across the tracks, of the groove that the wheel leaves at (x, y) on `shape`. The
+    /// tracks run along x.
+    ///
+    /// The gap between wheel and part is approximated by a quadratic function of x and y around the contact. At each
+    /// distance across the tracks, the wheel cuts down to the minimum of this gap along x. The result is the curvature
+    /// of these minima. If the gap has no mixed second derivative, this is the curvature of the wheel minus the
+    /// curvature of the part.
+    ///
+    /// Returns 0 where the wheel leaves no groove, for example in a hollow that is narrower than the wheel.
     pub fn bend_at(shape: &dyn Shape, wheel_radius_mm: f64, [x, y]: [f64; 2]) -> f64 {
         let ([p, q], hessian) = (shape.gradient(x, y), shape.hessian(x, y));
         let w = 1.0 / (1.0 + p * p + q * q).sqrt();
@@ -484,11 +489,14 @@ impl Part {
         ([sx + h * n[0], sy + h * n[1], sz + h * n[2]], tx, ty)
     }
 
-    /// Moves a ball along the straight path `way` until it touches the part. Returns the centre of the ball and the
-    /// contact. Returns `Contact::Unexpected` if the ball touches before the start of the path and this start is over
-    /// the aperture. Returns `Contact::Missed` if the path ends without a touch.
+    /// Moves a ball along the straight path `way` until it touches the part. Returns `Contact::Touched` with the centre
+    /// of the ball and the contact.
     ///
-    /// A contact beyond the aperture also counts as a miss, because the side and the rim of the part are not modelled.
+    /// Returns `Contact::Missed` if the path ends without a touch. A contact outside the aperture is also
+    /// `Contact::Missed`, because the side and the rim of the part are not modelled.
+    ///
+    /// If the ball already touches before the start of the path, returns `Contact::Unexpected` if (x, y) of the start
+    /// is inside the aperture. Otherwise returns `Contact::Missed`.
     pub fn touch(&self, way: &Approach) -> Contact {
         let start = way.centre(way.from_mm);
         let Some(t) = self.near_contact(way) else { return Contact::Missed };
@@ -505,8 +513,9 @@ impl Part {
         }
     }
 
-    /// Returns the distance in mm, to first order, between a ball and the real surface at the bottom of the grooves.
-    /// `c` is the centre of the ball. The distance is negative if the ball is inside the material.
+    /// Returns the distance in mm between a ball and the real surface, to first order. `c` is the centre of the ball,
+    /// and `radius_mm` is its radius. The ridges between the grooves are ignored: the real surface is taken at the
+    /// bottom of the grooves. The distance is negative if the ball is inside the material.
     fn gap(&self, c: Vec3, radius_mm: f64) -> f64 {
         let [p, q] = self.shape.gradient(c[0], c[1]);
         let vertical = c[2] - self.shape.height(c[0], c[1]);

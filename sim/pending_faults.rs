@@ -32,12 +32,12 @@ impl<Place, Fault> PendingFaults<Place, Fault> {
         self.rules().clear();
     }
 
-    /// Returns the fault that is due at the present line or command, and removes this fault from the list. `is_meant`
-    /// returns true for each place that matches the present line or command.
+    /// Returns the fault that must happen at the present line or command, and removes this fault from the list.
+    /// `is_meant` returns true for a place that matches the present line or command.
     ///
-    /// A fault is due if its place matches and no occurrences are left to skip. A matching fault that is not yet due
-    /// skips one occurrence less from now on. If several faults are due, returns the one that was added first; the
-    /// others stay in the list. Returns `None` if no fault is due.
+    /// Each fault in the list has a number of matches to skip. If its place matches and this number is above 0, the
+    /// number decreases by 1. If its place matches and this number is 0, the fault is due. If several faults are due,
+    /// returns the one that was added first; the others stay in the list. Returns `None` if no fault is due.
     pub(crate) fn next_at(&self, is_meant: impl Fn(&Place) -> bool) -> Option<Fault> {
         let mut rules = self.rules();
         let mut met = None;

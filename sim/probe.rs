@@ -52,7 +52,8 @@ impl Placement {
         }
     }
 
-    /// Transforms a point from the part's frame to the machine's.
+    /// Transforms the point `p` from the part's frame to the machine's frame, by the rotation and then the translation
+    /// of this placement.
     pub fn apply(&self, p: Vec3) -> Vec3 {
         std::array::from_fn(|i| {
             let r = &self.rotation[i];
@@ -68,12 +69,13 @@ fn unit<const N: usize>(rng: &mut Rng) -> [f64; N] {
     v.map(|c| c / norm)
 }
 
-/// Returns the centre, in mm, of a probe ball that touches the ground surface. The ball has the radius `radius_mm`. The
-/// contact point is S + e n: S is the nominal point of `shape` at (x, y), n the nominal unit normal at S, and e the
-/// error of `form` at (x, y), in mm.
+/// Returns the centre, in mm, of a probe ball that touches the ground surface (the nominal surface with its form
+/// error). The ball has the radius `radius_mm`. The contact point is S + e n: S is the nominal point of `shape` at (x,
+/// y), n the nominal unit normal at S, and e the error of `form` at (x, y), in mm.
 ///
 /// The ball touches along the normal of the ground surface, not along n. This normal is computed from n, e and the
-/// gradient of e, without linearization. The data therefore contain the second-order term of the paper's eq. (6).
+/// gradient of e, without linearization. The centre therefore contains the second-order term of eq. (6) of the paper
+/// that docs/method.md describes.
 pub fn centre(shape: &dyn Shape, form: &FormError, radius_mm: f64, x: f64, y: f64) -> Vec3 {
     let (s, n, e) = (shape.point(x, y), shape.normal(x, y), form.height(x, y));
     let [p, q] = shape.gradient(x, y);

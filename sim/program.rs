@@ -75,7 +75,8 @@ impl CircularArc {
         Ok(Self { axes, centre_mm, sweep_rad })
     }
 
-    /// Returns the position on the arc from `from` to `to` after the fraction `share` of its angle, from 0 to 1.
+    /// Returns the position in mm on the arc from `from` to `to`, after the fraction `share` (0 to 1) of the angle of
+    /// the arc. Along the axis normal to the plane of the arc, the position changes linearly with `share`.
     fn position_at(&self, from: [f64; 3], to: [f64; 3], share: f64) -> [f64; 3] {
         let [a, b, c] = self.axes;
         let (u, v) = (from[a] - self.centre_mm[0], from[b] - self.centre_mm[1]);
@@ -91,7 +92,9 @@ impl CircularArc {
         (from[self.axes[0]] - self.centre_mm[0]).hypot(from[self.axes[1]] - self.centre_mm[1])
     }
 
-    /// Returns the number of chords that replace the arc from `from` with a deviation of at most `within_mm`, in mm.
+    /// Returns the number of chords (straight lines between points of the arc) that replace the arc. `from` is the
+    /// start of the arc in mm. `within_mm` is the maximum deviation of a chord from the arc, in mm. The number is
+    /// limited to 1 000 000.
     fn chords(&self, from: [f64; 3], within_mm: f64) -> usize {
         let each = (8.0 * within_mm / self.radius_mm(from)).sqrt();
         (self.sweep_rad.abs() / each).ceil().clamp(1.0, 1e6) as usize
@@ -132,8 +135,9 @@ impl Waypoint {
         }
     }
 
-    /// Returns the end points of straight moves that replace this move, with a deviation of at most `within_mm`. The
-    /// move begins at `from_mm`.
+    /// Replaces this move by straight moves, and returns the end points of these straight moves in mm. The move begins
+    /// at `from_mm`. The straight moves deviate from this move by at most `within_mm`, in mm. For a move that is
+    /// already straight, returns only its end point.
     pub fn in_chords(&self, from_mm: [f64; 3], within_mm: f64) -> Vec<[f64; 3]> {
         let count = self.arc.as_ref().map_or(1, |turn| turn.chords(from_mm, within_mm));
         let inner = (1..count).map(|k| self.position_at(from_mm, k as f64 / count as f64));
@@ -177,8 +181,9 @@ impl Program {
         why.map_or(Ok(self), Err)
     }
 
-    /// Returns the position of the wheel's centre on the move from `from` to `to`, after the fraction `share` of the
-    /// move, from 0 to 1.
+    /// Returns the position in mm of the wheel's centre during the move from `from` to `to`. `share` is the completed
+    /// fraction of the move, from 0 to 1. If the machine has a rotary head, the position includes the rotation of the
+    /// head.
     pub fn centre_mm(&self, from: &Waypoint, to: &Waypoint, share: f64) -> [f64; 3] {
         match &self.head {
             Some(head) => head.centre_on_move_mm(from, to, share),
@@ -200,7 +205,8 @@ impl Program {
 }
 
 impl Control {
-    /// Returns the control of a dialect, for example `fanuc`, or `None` for an unknown dialect.
+    /// Returns the numerical control that uses the program dialect `dialect`: `linuxcnc`, `fanuc`, `sinumerik` or
+    /// `heidenhain`. Returns `None` for any other text.
     pub fn named(dialect: &str) -> Option<Self> {
         let known = [
             ("linuxcnc", Self::Linuxcnc),
@@ -214,9 +220,9 @@ impl Control {
     /// Parses the program `text` as this control would.
     ///
     /// # Errors
-    /// Returns a message if the control would stop, or if it would do something other than the program seems to say.
-    /// The message names the first such line and the reason. Also returns an error if the program is not complete, for
-    /// example if it has no end.
+    /// Returns a message if the control would stop at a line, or if a line would have a different effect than its text
+    /// suggests. The message names the first such line and the reason. Also returns an error if the program is not
+    /// complete, for example if it has no end.
     pub fn read(self, text: &str) -> Result<Program, String> {
         let mut reader = Reader { control: self, ..Reader::default() };
         reader.program.by_kinematics = self == Self::Linuxcnc;
@@ -393,9 +399,10 @@ impl Reader {
         Ok(None)
     }
 
-    /// Records whether the selected path mode is exact. A path mode is exact only if it limits how far the control
-    /// rounds corners. `smooth` is the number of the G word that selects the path mode, times 10. `level` is the number
-    /// of the Q word; only a Fanuc control uses it. If `smooth` is `None`, nothing changes. Always returns `Ok`.
+    /// Records whether the selected path mode (how the control rounds corners) is exact. A path mode is exact only if
+    /// it limits the deviation at corners. `smooth` is the number of the G word that selects the path mode, times 10.
+    /// If `smooth` is `None`, nothing changes. `level` is the value of the Q word of a Fanuc control; the mode G5.1 is
+    /// exact only with Q1. Other controls ignore `level`. Always returns `Ok`.
     fn exactness(&mut self, smooth: Option<i64>, level: Option<f64>) -> Result<(), String> {
         let tolerance = self.program.tolerance_mm.is_some_and(|mm| mm > 0.0);
         self.exact = match (self.control, smooth) {

@@ -434,7 +434,8 @@ impl SimulatedMachine {
         self.handshake.spoil();
     }
 
-    /// Stops the machine with the fault number `fault` of docs/modbus.md.
+    /// Stops the machine with the fault number `fault` of docs/modbus.md. The machine moves clear of the part and
+    /// enters FAULTED. A running job ends with the result failed.
     pub fn fail(&mut self, fault: u16) {
         self.handshake.fail(fault);
         self.publish();

@@ -12,15 +12,15 @@ pub trait Shape: Send + Sync {
     fn height(&self, x: f64, y: f64) -> f64;
     /// Returns the derivatives dz/dx and dz/dy of the surface at (x, y).
     fn gradient(&self, x: f64, y: f64) -> [f64; 2];
-    /// Returns the second derivatives of z: by x twice, by x and y, by y twice.
+    /// Returns the second derivatives d²z/dx², d²z/(dx dy) and d²z/dy² of the surface at (x, y), in 1/mm.
     fn hessian(&self, x: f64, y: f64) -> [f64; 3];
 
-    /// Returns the point of the surface above (x, y).
+    /// Returns the point (x, y, z) of the surface at the position (x, y), in mm.
     fn point(&self, x: f64, y: f64) -> Vec3 {
         [x, y, self.height(x, y)]
     }
 
-    /// Returns the unit normal above (x, y); its z component is positive.
+    /// Returns the unit normal of the surface at the position (x, y). The z component of the normal is positive.
     fn normal(&self, x: f64, y: f64) -> Vec3 {
         let [p, q] = self.gradient(x, y);
         let w = 1.0 / (1.0 + p * p + q * q).sqrt();

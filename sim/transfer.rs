@@ -46,12 +46,12 @@ pub(crate) struct Inbox {
 }
 
 impl Inbox {
-    /// Reads the header of a new payload and prepares the inbox for the pages of this payload. `order` is the word
-    /// order of the machine, and `words` are the registers of the header. `of` is the kind of machine. `limit_bytes` is
-    /// the maximum length of a payload, in bytes.
+    /// Reads the header of a new payload and prepares the inbox for the pages of this payload. A page is a block of at
+    /// most 112 data registers. `order` is the word order of the machine, and `words` are the registers of the header.
+    /// `of` is the kind of machine. `limit_bytes` is the maximum length of a payload, in bytes.
     ///
     /// Returns true if the header is accepted. Returns false, and changes nothing, if the machine does not use this
-    /// kind of payload, if its length is 0, or if its length is above the limit.
+    /// kind of payload, if the length of the payload is 0, or if this length is above the limit.
     pub(crate) fn header(&mut self, order: WordOrder, words: &[u16], of: Kind, limit_bytes: u32) -> bool {
         let (kind, announced_bytes) = (words[0], order.to_u32([words[2], words[3]]));
         if slot_of(of, kind).is_none() || announced_bytes == 0 || announced_bytes > limit_bytes {
@@ -70,12 +70,15 @@ impl Inbox {
         true
     }
 
-    /// Reads one page of a payload. `order` is the word order of the machine, and `words` are the registers of the
-    /// page.
+    /// Reads one page of a payload. A page is a block of at most 112 data registers, after 8 registers with its number
+    /// and length. `order` is the word order of the machine, and `words` are the registers of the page.
     ///
-    /// Returns `None` if the page is refused: it is not the next page, its length is wrong, or no header came before.
-    /// Returns `Some(Some(_))` with the complete payload if this is the last page and the CRC is right. Returns
-    /// `Some(None)` if pages are still missing, if the page was already accepted, or if the CRC is wrong.
+    /// Returns one of three values:
+    ///
+    /// - `None`: the page is refused. It is not the next page, its length is wrong, or no header came before.
+    /// - `Some(Some(_))`: the page was the last one and the CRC is right. The value contains the complete payload.
+    /// - `Some(None)`: the page is accepted, but there is no complete payload. Pages are still missing, the page was
+    ///   already accepted before, or the CRC is wrong.
     pub(crate) fn page(&mut self, order: WordOrder, words: &[u16]) -> Option<Option<Arrived>> {
         if self.has_page(order, words) {
             return Some(None);
@@ -91,7 +94,8 @@ impl Inbox {
         Some(if self.bytes.len() as u32 == self.announced_bytes { self.close() } else { None })
     }
 
-    /// Returns true if the page whose number is in `words` was accepted already.
+    /// Returns true if a page was accepted already. `words` are the registers of this page; the first two contain its
+    /// number. `order` is the word order of the machine, which is necessary to read the number.
     pub(crate) fn has_page(&self, order: WordOrder, words: &[u16]) -> bool {
         order.to_u32([words[0], words[1]]) < self.next_page
     }
@@ -106,7 +110,8 @@ impl Inbox {
         Some(Arrived { kind: self.kind, bytes: self.bytes.clone(), identity: self.identity })
     }
 
-    /// Marks the payload that has arrived as refused. `answer` is the number of the reason in docs/modbus.md.
+    /// Marks the payload in the inbox as refused: the machine cannot use it. `answer` is the number of the reason, from
+    /// the list in docs/modbus.md. The client can read this number.
     pub(crate) fn refuse(&mut self, answer: u16) {
         self.state = InboxState::Refused;
         self.reason = answer;
@@ -188,9 +193,13 @@ pub(crate) struct Origin {
 }
 
 impl Outbox {
-    /// Packs the result so far of a running job as an outbox (the registers from which a client reads a result).
-    /// `order` is the word order of the machine, and `origin` identifies the job. The CRC and the `done` number in the
-    /// header are 0. The outbox contains only full pages. Returns `None` if a value in the header is not finite.
+    /// Packs the records that a running job has produced so far as an outbox (the registers from which a client reads a
+    /// result). `outcome` contains these records. `order` is the word order of the machine, and `origin` identifies the
+    /// job.
+    ///
+    /// In the header, the CRC is 0. The `done` number, by which a client acknowledges a finished result, is also 0. The
+    /// outbox contains only full pages of 112 data registers. Returns `None` if a value in the header, for example the
+    /// temperature, is not finite.
     pub(crate) fn partial(order: WordOrder, outcome: ResultData, origin: Origin) -> Option<Self> {
         let mut outbox = Self::new(order, outcome, Origin { done: 0, ..origin })?;
         outbox.header[4..6].fill(0);

@@ -192,7 +192,8 @@ impl WorldState {
         self.holder.is_some_and(|other| other != kind)
     }
 
-    /// Gives the part to a machine. Returns false, and does nothing, if the other machine has the part.
+    /// Gives the part to the machine `kind` and marks this machine as not clear of the part. Returns true if this is
+    /// done. Returns false, and changes nothing, if the other machine has the part.
     pub fn claim_part(&mut self, kind: Kind) -> bool {
         if self.is_held_by_other(kind) {
             return false;

@@ -26,8 +26,9 @@ struct Track {
 }
 
 impl Track {
-    /// Returns the height at `x`, interpolated along the track; beyond the ends of the track, the height at its end.
-    /// Returns `None` for a track without samples.
+    /// Returns the height of the track over the nominal surface at the coordinate `x`, in mm. The height is
+    /// interpolated linearly between the neighbouring samples of the track. Beyond an end of the track, it is the
+    /// height of the sample at this end. Returns `None` if the track has no samples.
     fn height_at(&self, x: f64) -> Option<f64> {
         let near = |a: &&[f64; 2], b: &&[f64; 2]| (a[0] - x).abs().total_cmp(&(b[0] - x).abs());
         let below = self.places.iter().filter(|place| place[0] <= x).min_by(near);
@@ -70,9 +71,13 @@ impl PlainWheel {
         locked(&self.world).release(Kind::Grinder);
     }
 
-    /// Moves the centre of the wheel to `centre_mm`, a position in the model frame. Grinds the part between the present
-    /// track and the previous one. A wheel that is more than 1 mm away from the nominal surface ends the present track.
-    /// Does nothing if the position cannot be projected onto the surface.
+    /// Moves the centre of the wheel to `centre_mm`, a position in the model frame. A track is a series of wheel
+    /// positions whose y differs from that of the first one by at most 0.2 mm. A position with another y begins a new
+    /// track.
+    ///
+    /// If there is a previous track, grinds the part between the previous track and the present one, from the last x to
+    /// the new x. If the wheel is more than 1 mm above the nominal surface, it grinds nothing and the present track
+    /// ends. Does nothing if the position cannot be projected onto the surface.
     pub fn move_to(&mut self, centre_mm: Vec3) {
         let world = Arc::clone(&self.world);
         let mut state = locked(&world);

@@ -49,14 +49,16 @@ impl World {
         Grinder::new(self.state.clone())
     }
 
-    /// Returns the simulated measuring machine, which measures by a plan. A world has only one measuring machine, so
-    /// connect it to only one wire (simulated interface).
+    /// Returns the simulated measuring machine. A client sends a measuring plan to this machine, and the machine then
+    /// measures all points of the plan. A world has only one measuring machine, so connect it to only one wire
+    /// (simulated interface).
     pub fn cmm(&self) -> Cmm {
         Cmm::new(self.state.clone())
     }
 
-    /// Returns the probe of the simulated measuring machine, for a server that commands each touch. A world has only
-    /// one measuring machine, so connect it to only one wire (simulated interface).
+    /// Returns the probe of the simulated measuring machine. Use this probe for a server that has no measuring plan and
+    /// commands each touch separately. A world has only one measuring machine, so connect it to only one wire
+    /// (simulated interface).
     pub fn touch_probe(&self) -> TouchProbe {
         TouchProbe::new(self.state.clone())
     }
@@ -108,8 +110,9 @@ impl World {
         locked(&self.state).part.deviation_mm(x_mm, y_mm)
     }
 
-    /// Returns the true deviation of the real surface from the nominal surface for each position (x, y) in `places_mm`,
-    /// in mm along the normal. The positions are in the model frame. The part does not change between two values.
+    /// Returns the true deviation of the real surface from the nominal surface for each position (x, y) in `places_mm`.
+    /// The deviation is in mm along the normal, and positive where there is too much material. The positions are in mm
+    /// in the model frame. All values belong to the same moment: the part cannot be ground during this call.
     pub fn deviations_mm(&self, places_mm: &[[f64; 2]]) -> Vec<f64> {
         let state = locked(&self.state);
         places_mm.iter().map(|&[x, y]| state.part.deviation_mm(x, y)).collect()
@@ -167,7 +170,8 @@ impl World {
         on_part.iter().sum::<f64>() / on_part.len() as f64
     }
 
-    /// Returns the true RMS of the random error of a pass, in mm. No compensation can remove it.
+    /// Returns the RMS of the random height error that the grinder adds in each pass, in mm. This is the value
+    /// `repeatability_um` of the specification. The error differs in each pass, so no compensation can remove it.
     pub fn repeatability_mm(&self) -> f64 {
         locked(&self.state).spec.grinder.repeatability_um * 1e-3
     }

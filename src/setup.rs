@@ -189,13 +189,13 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
     Ok((task, plan))
 }
 
-/// Returns the settings for the compensation of machine parameters: the tolerances of the parameters, the effect of the
-/// wheel radius, and a point of the surface for each node of the correction grid. `ground` is the surface to grind with
-/// the outline of the part, or the reason why no path can be planned. Returns `None` if the recipe compensates no
-/// parameters.
+/// Returns the settings for the compensation of machine parameters. These are the tolerances of the parameters, the
+/// direction in which an error of the wheel radius acts on the surface (along the normal or in height), and a point of
+/// the surface for each node of the correction grid. `ground` is the surface to grind with the outline of the part, or
+/// the reason why no path can be planned. Returns `None` if the recipe does not compensate parameters.
 ///
 /// # Errors
-/// Returns an error if parameters are to be compensated and `ground` is an error.
+/// Returns an error if the recipe compensates parameters and `ground` is an error.
 fn parameter_compensation(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -229,8 +229,9 @@ fn locked_sigmas(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
     Some([shift_mm, shift_mm / half_mm[0].max(half_mm[1])])
 }
 
-/// Returns the options of an adaptive measurement. Returns `None` if the recipe does not select the adaptive mode, or
-/// states no accepted risk.
+/// Returns the options of an adaptive measurement: the tolerance, the accepted risk, and the maximum number of cycles.
+/// The accepted risk is the probability of accepting a part that is out of tolerance. Returns `None` if the measuring
+/// mode of the recipe is not adaptive, or if the recipe does not state `accepted_risk`.
 fn adaptive(recipe: &Recipe) -> Option<AdaptiveOptions> {
     let accepted_risk = recipe.measure.accepted_risk.filter(|_| recipe.measure.mode == SelectionMode::Adaptive)?;
     Some(AdaptiveOptions {
@@ -240,8 +241,9 @@ fn adaptive(recipe: &Recipe) -> Option<AdaptiveOptions> {
     })
 }
 
-/// Returns the minimum share (0 to 1) of planned targets for which the probe must find a point. It is `min_coverage` of
-/// the recipe. For an adaptive measurement it is less, so that one touch of the first batch can miss the part.
+/// Returns the minimum share (0 to 1) of the planned targets at which the probe must find a point. The share is
+/// `min_coverage` of the recipe. For an adaptive measurement, `min_coverage` is multiplied by
+/// [`AdaptiveOptions::FIRST_BATCH_MIN_SHARE`]. Thus one touch of the first batch can miss the part.
 fn min_found_share(recipe: &Recipe) -> f64 {
     // One of the first touches can miss. The task checks the share of all touches.
     let share =
@@ -263,8 +265,8 @@ fn tolerance(recipe: &Recipe) -> Tolerance {
 }
 
 /// Returns the timeout for the transfer of `bytes` bytes to a machine on a serial Modbus line (RTU). The timeout is
-/// three times the computed duration, to allow for retries. Returns zero for every other kind of connection, including
-/// Modbus TCP.
+/// three times the transfer time that follows from the baud rate and the number of bytes. The factor of three allows
+/// for retries. Returns zero for every other kind of connection, including Modbus TCP.
 fn transfer_timeout(link: &LinkConfig, bytes: usize) -> Duration {
     let Some((LineAddress::Rtu { baud, .. }, _)) = link.wire.modbus_line() else { return Duration::ZERO };
     // A page has 224 bytes of data in a frame of 249 and a response of 8. The machine needs some time for each page.
@@ -582,12 +584,16 @@ fn is_from_below(recipe: &Recipe) -> bool {
 /// Returns the distance between the tracks of the wheel in mm, and the scallops (the ridges between the tracks) at this
 /// distance. `ground` is the surface to grind with the outline of the part, or the reason why no path can be planned.
 ///
-/// The distance is `track_mm` of the recipe. If the recipe limits the scallop height by `scallop_nm`, it is the largest
-/// distance that respects this limit, and `track_mm` is its upper bound. If the recipe states neither, the distance
-/// follows from the tolerances of the recipe. Without `track_mm`, the distance is at most the radius of the wheel and
-/// half of the shorter side of the part.
+/// The distance depends on the keys of the recipe:
 ///
-/// The scallops are `None` if `ground` is an error. The distance is then `track_mm`.
+/// - Only `track_mm`: the distance is `track_mm`.
+/// - Only `scallop_nm` (the maximum height of the scallops): the distance is the largest one that respects this height.
+/// - Both: the distance is the largest one that respects `scallop_nm`, and at most `track_mm`.
+/// - Neither: the distance follows from the tolerances of the recipe, see [`track_for_tolerance_mm`].
+///
+/// Without `track_mm`, the distance is also at most the radius of the wheel, and at most half of the shorter side of
+/// the part. If `ground` is an error and the recipe states `track_mm`, the distance is `track_mm` and the scallops are
+/// `None`.
 ///
 /// # Errors
 /// Returns an error if no path can be planned and the recipe does not state `track_mm`, or if the target surface cannot
@@ -626,9 +632,11 @@ fn track_distance(
 }
 
 /// Returns the maximum distance between tracks in mm at which the scallops (the ridges between the tracks) are small
-/// enough. Their height may be at most [`MAX_SCALLOP_SHARE`] times the PV limit of the recipe, and their rms at most
-/// [`MAX_SCALLOP_SHARE`] times the RMS limit. The result is rounded down to two significant digits. The result is
-/// infinite if the recipe states neither limit, or if there are no scallops at any distance.
+/// enough for the limits of the recipe. The height of the scallops may be at most [`MAX_SCALLOP_SHARE`] times the PV
+/// limit. Their rms may be at most [`MAX_SCALLOP_SHARE`] times the RMS limit. `scallops` gives height and rms for one
+/// distance. For other distances, height and rms are proportional to the square of the distance. The result is rounded
+/// down to two significant digits. The result is infinite if the recipe states neither limit, or if the wheel leaves no
+/// scallops.
 pub fn track_for_tolerance_mm(recipe: &Recipe, scallops: &Scallops) -> f64 {
     let share = |limit: Option<Micrometres>| limit.map_or(f64::INFINITY, |um| MAX_SCALLOP_SHARE * um.mm());
     let most_mm = scallops.max_track_mm(share(recipe.acceptance.pv_um), share(recipe.acceptance.rms_um));
@@ -740,9 +748,10 @@ fn path_wheel(wheel: &WheelDimensions, nominal: &Nominal) -> PathWheel {
     }
 }
 
-/// Returns the thermal expansion coefficients, in 1/K, of the part and of the scales of the CMM, with the uncertainties
-/// of the part's coefficient and of the temperature. If the recipe does not state the uncertainty of the coefficient,
-/// it is 10 % of the coefficient. Returns `None` if the recipe does not state the coefficient of the part.
+/// Returns the thermal expansion coefficients, in 1/K, of the part and of the scales of the CMM. The result also
+/// contains two standard uncertainties: that of the part's coefficient in 1/K, and that of the temperature in K. If the
+/// recipe does not state the uncertainty of the part's coefficient, the uncertainty is 10 % of the coefficient. Returns
+/// `None` if the recipe does not state the coefficient of the part.
 fn expansion(recipe: &Recipe, cell: &CellConfig) -> Option<ThermalExpansion> {
     const MILLIONTH: f64 = 1e-6;
     let of_part = recipe.part.expansion_um_m_k?;
@@ -793,7 +802,8 @@ fn cell_plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
 /// of the client. A machine that several clients can reach uses these two numbers to distinguish the clients.
 ///
 /// # Errors
-/// Returns an error if a connection cannot be opened, a folder does not exist, or reference points cannot be read.
+/// Returns an error if a connection cannot be opened, if a folder does not exist, or if the file of reference points
+/// (points with known positions, for a CMM that measures from several stations) cannot be read.
 pub fn create_drivers(
     recipe: &Recipe,
     cell: &CellConfig,
@@ -837,7 +847,8 @@ pub fn modbus_settings(link: &LinkConfig, simulated: bool, owner: u32, epoch: u3
 /// is created and dropped. Sends nothing to the machine.
 ///
 /// # Errors
-/// Returns an error if the connection cannot be opened, a folder does not exist, or reference points cannot be read.
+/// Returns an error if the connection cannot be opened, if a folder does not exist, or if the file of reference points
+/// (points with known positions, for a CMM that measures from several stations) cannot be read.
 pub fn check_machine(cell: &CellConfig, device: Device) -> Result<(), DriverError> {
     let link = match device {
         Device::Cmm => &cell.cmm.link,
@@ -856,7 +867,8 @@ pub fn check_machine(cell: &CellConfig, device: Device) -> Result<(), DriverErro
 /// Sends nothing to the machine.
 ///
 /// # Errors
-/// Returns an error if the connection cannot be opened, a folder does not exist, or reference points cannot be read.
+/// Returns an error if the connection cannot be opened, if a folder does not exist, or if the file of reference points
+/// (points with known positions, for a CMM that measures from several stations) cannot be read.
 pub fn create_cmm(cell: &CellConfig) -> Result<AnyCmm, DriverError> {
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
     let link = &cell.cmm.link;
@@ -885,8 +897,9 @@ fn probe_travel_mm(cell: &CellConfig) -> Option<[[f64; 3]; 2]> {
 }
 
 /// Returns a driver context with the connection settings of one machine from `link`. The fields for the part, the run
-/// and the folders are empty. A caller that needs these fields sets them afterwards. `owner` is the number of this
-/// client, and `epoch` increases with each start of the client.
+/// and the folders are empty. A caller that needs these fields sets them afterwards. `simulated` is true if the
+/// machines of the cell are simulations. `owner` is the number of this client, and `epoch` increases with each start of
+/// the client.
 fn driver_context(link: &LinkConfig, simulated: bool, [owner, epoch]: [u32; 2]) -> DriverContext<'_> {
     DriverContext {
         part: "",

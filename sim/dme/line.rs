@@ -15,8 +15,8 @@ impl Tag {
     /// Tag of a message that no command requested.
     pub const UNSOLICITED: Self = Self { event: true, number: 0 };
 
-    /// Returns true for the tag of an event command. The server carries out such a command at once, before the queued
-    /// commands.
+    /// Returns true if this is the tag of an event command, for example `E0001`. The server carries out an event
+    /// command at once, before the queued commands.
     pub fn is_event(self) -> bool {
         self.event
     }
@@ -40,8 +40,8 @@ pub struct DmeError {
 }
 
 impl DmeError {
-    /// Creates an error of the I++ DME standard with its number and severity. `cause` is the command or the text that
-    /// caused it.
+    /// Creates an error with the error number `number` of the I++ DME standard. The number determines the severity.
+    /// `cause` is the command or the text that caused the error.
     pub fn new(number: u16, cause: &str) -> Self {
         let severity = match number {
             504 => 1,

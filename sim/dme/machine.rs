@@ -232,8 +232,11 @@ impl DmeMachine {
         self.at_mm = at_mm;
     }
 
-    /// Ends the current motion after the fraction `share` of its path, from 0 (start) to 1 (end). Releases the part if
-    /// there was no contact yet, or if the probe is then more than twice the approach distance above the last contact.
+    /// Ends the current motion after the fraction `share` of its path, from 0 (start) to 1 (end). Also releases the
+    /// part in two cases:
+    ///
+    /// - The probe has not touched anything since the part was last released.
+    /// - The end position is higher (in z) than the last contact by more than twice the approach distance.
     pub(super) fn stop_short(&mut self, share: f64) {
         self.at_mm = std::array::from_fn(|k| self.at_mm[k] + share * (self.to_mm[k] - self.at_mm[k]));
         self.to_mm = self.at_mm;
@@ -484,8 +487,9 @@ impl DmeMachine {
         told.collect::<Result<_, _>>().map(CommandResult::with_data)
     }
 
-    /// Sets parameters of the tool. A value beyond a limit of the machine is replaced by the limit, with a warning that
-    /// names `cause`.
+    /// Sets parameters of the tool, such as speeds and search distances. Each item of `properties` is the name of a
+    /// parameter with its new value. A value outside its limits is replaced by the nearest limit. In this case, the
+    /// result contains a warning (error 504) with the text `cause`, which is the name of the command.
     ///
     /// # Errors
     /// Returns 502 for an argument that is not a property with one number, and 510 for an unknown property.

@@ -52,8 +52,9 @@ struct Running {
 }
 
 impl Running {
-    /// Returns the real time at which this command sends its next output. The output is the next line of a scan, or the
-    /// end of the command if no line is left. `speed` is the number of simulated seconds in a real second.
+    /// Returns the time at which this command sends its next output, in real time on the caller's clock. The output is
+    /// the next line of a scan. If no line of a scan is left, the output is the end of the command. `speed` is the
+    /// number of simulated seconds in a real second.
     fn next(&self, speed: f64) -> Duration {
         let line = self.done.as_ref().ok().and_then(|done| done.scanned.front());
         line.map_or(self.ends, |line| {
@@ -155,7 +156,8 @@ impl Server {
         self.say(now, format!("E0000 ! {}", DmeError::new(500, "emergency")));
     }
 
-    /// Advances the simulation to the time `now`, and returns the lines that are due.
+    /// Advances the simulation to the time `now`. Returns the lines that the server must send to the client up to this
+    /// time, and removes these lines from the queue.
     pub fn tick(&mut self, now: Duration) -> Vec<Outgoing> {
         self.advance_time(now);
         let mut due = Vec::new();
@@ -345,8 +347,16 @@ impl Server {
         }
     }
 
-    /// Sends one line of data of the command with the tag `tag`, at the time `at`. `fault`, if there is one, changes
-    /// this line, for example by reversed fields.
+    /// Queues one data line for the client, to be sent at the time `at`. `tag` is the tag of the command, and `data`
+    /// contains the fields of the line. Some values of `fault` change the output:
+    ///
+    /// - `Reordered` reverses the order of the fields.
+    /// - `UnaskedQuality` adds the field `Q(0)` before the other fields, if the first field contains a parenthesis.
+    /// - `Garbled` removes all closing parentheses.
+    /// - `Twice` sends the line twice, and `Split` sends the line byte by byte.
+    /// - `Stranger` adds a line with the tag of a command that was never sent.
+    ///
+    /// Any other fault changes nothing.
     fn say_data(&mut self, tag: Tag, data: &[String], fault: Option<&Fault>, at: Duration) {
         let mut fields = data.to_vec();
         match fault {

@@ -100,8 +100,14 @@ fn distance(a: Vec3, b: Vec3) -> f64 {
     (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Returns the fields of all points of a scan line, joined in their order. The faults `UnaskedQuality`, `PointLost` and
-/// `PointsShifted` change the points before. Any other `fault` changes nothing.
+/// Returns the fields of all points of a scan line as one list, in the order of the points. Three values of `fault`
+/// change the points first:
+///
+/// - `UnaskedQuality` adds the field `0` at the beginning of each point.
+/// - `PointLost` removes the fourth point, if the line has its full number of points (7).
+/// - `PointsShifted` replaces each point except the first by the point before it.
+///
+/// Any other `fault` changes nothing.
 pub(super) fn spoilt(mut line: Scanned, fault: Option<&Fault>) -> Vec<String> {
     match fault {
         Some(Fault::UnaskedQuality) => line.points.iter_mut().for_each(|point| point.insert(0, "0".to_owned())),

@@ -54,7 +54,9 @@ pub struct PartProgram {
 }
 
 impl PartProgram {
-    /// Creates the part program of a CMM that prints one line for each touch. It has no list of targets yet.
+    /// Creates a simulated part program: the program of a CMM that measures targets and prints one line for each touch.
+    /// `options` sets the probe radius and the format of the lines. `faults` contains the faults of certain lines. The
+    /// program has no list of targets yet.
     pub fn new(probe: TouchProbe, options: Options, faults: PrintFaults) -> Self {
         Self { probe, options, faults, list: None, next: 0, printed: 0 }
     }

@@ -134,7 +134,7 @@ impl Controller {
         self.moving
     }
 
-    /// Returns true if a program is active, paused or not.
+    /// Returns true if a program is active, that is, if it runs or is paused.
     pub fn is_busy(&self) -> bool {
         self.interpreter != Interpreter::Idle
     }
@@ -160,7 +160,8 @@ impl Controller {
         (self.stopped, self.on, self.homed) = (false, true, true);
     }
 
-    /// Switches the controller to a mode, as a person would. Does nothing while a program is active.
+    /// Switches the controller to the mode `mode` (`MANUAL`, `MDI` or `AUTO`), as a person at the machine would. Does
+    /// nothing while a program is active.
     pub fn set_mode(&mut self, mode: &'static str) {
         if !self.is_busy() {
             self.mode = mode;

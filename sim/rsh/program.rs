@@ -85,15 +85,16 @@ impl Program {
         self.lines.len()
     }
 
-    /// Goes back to the beginning of the program. The motion starts at the position `at_mm`.
+    /// Goes back to the first line of the program and resets the modes (motion, plane, arc centres, feed) to those of a
+    /// new program. `at_mm` is the position from which the first move starts, in mm.
     pub(super) fn rewind(&mut self, at_mm: Vec3) {
         (self.next, self.repeats, self.waits) = (0, None, false);
         (self.at_mm, self.motion, self.mm_s) = (at_mm, 0, 0.0);
         (self.plane, self.centres_are_absolute) = ([0, 1, 2], false);
     }
 
-    /// Allows [`Self::read_on`] to read further lines. This is necessary after a line that waits for the motion (M66);
-    /// the caller calls this function when all steps before that line have been carried out.
+    /// Allows [`Self::read_on`] to read further lines. [`Self::read_on`] stops at a line that waits for the motion
+    /// (M66). The caller calls this function when the machine has carried out all steps before that line.
     pub(super) fn go_on(&mut self) {
         self.waits = false;
     }
@@ -172,8 +173,10 @@ impl Program {
     }
 
     /// Returns the move from the present position to `to_mm`, in mm. The move is an arc if an arc mode (G2 or G3) is
-    /// active, otherwise it is straight. `centre` contains the words I, J and K of the line, in mm, which give the
-    /// centre of the arc; a missing word counts as 0.
+    /// active. Otherwise it is straight.
+    ///
+    /// `centre` contains the words I, J and K of the line, in mm. These words give the centre of the arc. They are
+    /// relative to the present position by default (G91.1), and absolute in the mode G90.1. A missing word counts as 0.
     ///
     /// # Errors
     /// Returns the reason if no arc about this centre joins the two positions.
@@ -191,8 +194,9 @@ impl Program {
     }
 }
 
-/// Returns the action on the log file that a line of the program requests. `text` is the line. It requests an action
-/// only if it is a comment such as `(LOG,text)` or `(LOGCLOSE)`. Returns `None` for any other line.
+/// Returns the action on the log file that the program line `text` requests. A line requests an action only if it is
+/// one of the comments `(LOGOPEN,path)`, `(LOGAPPEND,path)`, `(LOG,text)` and `(LOGCLOSE)`. Returns `None` for any
+/// other line.
 pub(super) fn says(text: &str) -> Option<LogAction> {
     let comment = text.trim().strip_prefix('(')?.strip_suffix(')')?;
     let (word, rest) = comment.split_once(',').unwrap_or((comment, ""));
@@ -205,7 +209,9 @@ pub(super) fn says(text: &str) -> Option<LogAction> {
     })
 }
 
-/// Returns the words of a block of G-code, each as a letter and its number, without comments.
+/// Returns the words of the line `text` of a G-code program. A word is a letter and its number; the letter is returned
+/// in upper case. Everything after the first `;` or `(` is a comment and is ignored. A letter without a valid number is
+/// omitted.
 fn words(text: &str) -> Vec<(char, f64)> {
     let code = text.split([';', '(']).next().unwrap_or_default();
     let starts: Vec<usize> = code.char_indices().filter(|(_, c)| c.is_ascii_alphabetic()).map(|(at, _)| at).collect();

@@ -35,7 +35,8 @@ impl From<Server> for SharedServer {
 }
 
 impl SharedServer {
-    /// Calls a function with exclusive access to the server.
+    /// Calls the function `look` with exclusive access to the server, and returns the result of `look`. Then wakes the
+    /// connection of the client, because the server can have new output.
     pub fn with<T>(&self, look: impl FnOnce(&mut Server) -> T) -> T {
         let looked = look(&mut self.locked());
         self.0.changed.notify_one();
@@ -51,7 +52,9 @@ impl SharedServer {
         self.0.server.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Serves a client until either side closes the connection. The session of the client ends then.
+    /// Serves one client on `stream`. Returns when the client or the server closes the connection, when `stream` fails,
+    /// or after a line of more than 65536 bytes. The session of the client then ends: the running command continues to
+    /// its end, and waiting commands are dropped.
     pub async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin) {
         self.serve_after(stream, None).await;
     }
@@ -104,10 +107,11 @@ pub struct ServingDme {
 }
 
 impl ServingDme {
-    /// Serves an I++ DME server over TCP. Port 0 takes any free port.
+    /// Serves the I++ DME server `server` over TCP at the address `addr`. With port 0, the operating system selects a
+    /// free port.
     ///
     /// # Errors
-    /// The address cannot be bound.
+    /// Returns an error if the address cannot be bound.
     pub async fn tcp(addr: impl ToSocketAddrs, server: Server) -> io::Result<Self> {
         Self::tcp_after(addr, server, None).await
     }
@@ -136,7 +140,7 @@ impl ServingDme {
         self.local_addr
     }
 
-    /// Calls a function with exclusive access to the server.
+    /// Calls the function `look` with exclusive access to the server, and returns the result of `look`.
     pub fn with<T>(&self, look: impl FnOnce(&mut Server) -> T) -> T {
         self.server.with(look)
     }

@@ -141,7 +141,8 @@ pub struct FaultPlan {
 }
 
 impl FaultPlan {
-    /// Creates a plan without faults. The seed is for the random choices of rules that are added to it.
+    /// Creates a plan without faults. `seed` initializes the random choices of the rules that the caller adds to the
+    /// plan later. Equal seeds give equal choices for the same sequence of requests.
     pub fn new(seed: u64) -> Self {
         Self { rules: Vec::new(), rng: crate::rng(seed), requests: 0, fired: Vec::new(), again: Vec::new() }
     }
@@ -194,23 +195,26 @@ impl SharedFaultPlan {
         Self::default()
     }
 
-    /// Replaces the fault plan of the wire by `plan`. The count of requests starts again. The list of the faults that
-    /// have happened, and the requests that were stored for a second execution, are lost.
+    /// Replaces the fault plan by `plan`. The requests are counted from 1 again. The list of the faults that have
+    /// happened is lost. Requests that were stored for a second execution are lost too.
     pub fn set(&self, plan: FaultPlan) {
         *self.lock() = plan;
     }
 
-    /// Returns the faults that have happened, each with its request.
+    /// Returns the faults that have happened since this plan was created or set, in order of time. Each fault comes
+    /// with the request to which it happened.
     pub fn fired(&self) -> Vec<(Request, Fault)> {
         self.lock().fired.clone()
     }
 
-    /// Returns the number of requests so far.
+    /// Returns the number of requests that were received since this plan was created or set.
     pub fn requests(&self) -> u64 {
         self.lock().requests
     }
 
-    /// Counts a request, stores its number in it, and returns the faults that happen to it.
+    /// Counts the request `request` and writes its number, from 1, into `request.number`. Returns the faults that the
+    /// rules of the plan select for this request. The list is empty if no rule selects it. Each returned fault is also
+    /// added to the list of faults that have happened.
     pub(crate) fn draw(&self, request: &mut Request) -> Vec<Fault> {
         let mut plan = self.lock();
         let FaultPlan { rules, rng, requests, fired, .. } = &mut *plan;

@@ -92,7 +92,8 @@ impl ServingHits {
         }
     }
 
-    /// Closes the connection after the bytes that are already queued.
+    /// Requests that the connection is closed after the bytes that were queued before are sent. Returns when this
+    /// request is queued, before the connection is closed.
     pub async fn hang_up(&self) {
         let _ = self.lines.send(LineAction::HangUp).await;
     }

@@ -70,7 +70,8 @@ impl SharedMachine {
         look(&mut self.lock().machine)
     }
 
-    /// Advances the machine by the real time since the last call, but at most by `MAX_TICK`.
+    /// Advances the simulated machine by the real time since the last call. One call advances it by at most `MAX_TICK`
+    /// (100 ms). The first call does not advance it.
     fn advance_time(&self) {
         let now = Instant::now();
         let last = self.lock().ticked.replace(now).unwrap_or(now);
@@ -164,9 +165,15 @@ impl Delivery {
     }
 }
 
-/// Carries out a Modbus request, and returns the answer as the wire delivers it, with its faults. `units` are the
-/// machines on the wire. `faults` is the fault plan. `framing` is the format of the answer (TCP or RTU). `unit` is the
-/// unit id and `pdu` the protocol data unit of the request.
+/// Executes a Modbus request and returns the answer with its simulated faults, for example a delay, wrong bytes or a
+/// closed connection. First executes the stored requests whose second execution is due before this request.
+///
+/// `units` are the machines with their unit ids. `faults` is the fault plan, which selects the faults of this request.
+/// `framing` is the format of the answer (TCP or RTU). `unit` is the unit id, and `pdu` is the protocol data unit of
+/// the request.
+///
+/// If no machine has the unit id, the answer is an exception on TCP, and there is no answer on RTU. A fault can prevent
+/// the execution of the request.
 fn answer(units: &Units, faults: &SharedFaultPlan, framing: Framing, unit: u8, pdu: &[u8]) -> Delivery {
     let machine = units.iter().find(|(id, _)| *id == unit).map(|(_, machine)| machine);
     let mut request = describe(machine, unit, pdu);
@@ -308,18 +315,20 @@ impl Drop for Serving {
 }
 
 impl Serving {
-    /// Serves machines, each with its unit number, over Modbus TCP. Port 0 takes any free port.
+    /// Serves machines over Modbus TCP at the address `addr`, without simulated faults. `units` contains each machine
+    /// with its unit id. With port 0, the operating system selects a free port.
     ///
     /// # Errors
-    /// The address cannot be bound.
+    /// Returns an error if the address cannot be bound.
     pub async fn tcp<M: Into<SharedMachine>>(addr: impl ToSocketAddrs, units: Vec<(u8, M)>) -> io::Result<Self> {
         Self::tcp_with(addr, units, SharedFaultPlan::none()).await
     }
 
-    /// Serves machines, each with its unit number, over Modbus TCP with the faults of a plan.
+    /// Serves machines over Modbus TCP at the address `addr`, with simulated faults. `units` contains each machine with
+    /// its unit id. `faults` is the fault plan. With port 0, the operating system selects a free port.
     ///
     /// # Errors
-    /// The address cannot be bound.
+    /// Returns an error if the address cannot be bound.
     pub async fn tcp_with<M: Into<SharedMachine>>(
         addr: impl ToSocketAddrs,
         units: Vec<(u8, M)>,
@@ -369,10 +378,12 @@ impl Serving {
         Ok(())
     }
 
-    /// Serves machines over Modbus RTU on a serial port of this computer: 8 data bits, no parity, 1 stop bit.
+    /// Serves machines over Modbus RTU on an existing serial port of this computer, with 8 data bits, no parity and 1
+    /// stop bit. `path` is the path of the port. `units` contains each machine with its unit id. `line` contains the
+    /// baud rate, and `faults` is the fault plan.
     ///
     /// # Errors
-    /// The port cannot be opened.
+    /// Returns an error if the port cannot be opened.
     pub fn rtu_at<M: Into<SharedMachine>>(
         path: impl AsRef<Path>,
         units: Vec<(u8, M)>,
@@ -418,25 +429,27 @@ impl Serving {
         self.path.as_deref()
     }
 
-    /// Returns the machines, each with its unit number.
+    /// Returns the served machines, each with its unit id.
     pub fn machines(&self) -> &Units {
         &self.machines
     }
 
-    /// Returns the machine with a unit number, or `None` if there is none.
+    /// Returns the served machine with the unit id `unit`. Returns `None` if there is no such machine.
     pub fn machine(&self, unit: u8) -> Option<&SharedMachine> {
         self.machines.iter().find(|(id, _)| *id == unit).map(|(_, machine)| machine)
     }
 
-    /// Returns the plan of the faults of this wire. It can be changed at any time.
+    /// Returns the fault plan of the served machines. A caller can replace this plan at any time with
+    /// [`SharedFaultPlan::set`].
     pub fn faults(&self) -> &SharedFaultPlan {
         &self.faults
     }
 
-    /// Waits until the wire fails, for example because a serial port is unplugged. A TCP port does not fail.
+    /// Waits until the simulated interface fails, for example because a serial port is unplugged, and returns the
+    /// failure as an error. Does not return while the interface works. A TCP port does not fail.
     ///
     /// # Errors
-    /// Returns the failure of the wire.
+    /// Returns the failure of the interface.
     pub async fn failed(&mut self) -> io::Result<()> {
         loop {
             match self.tasks.join_next().await {

@@ -24,7 +24,7 @@ pub struct Pty {
 }
 
 impl Pty {
-    /// Opens a pseudo-terminal in raw mode, which changes no byte.
+    /// Opens a pseudo-terminal in raw mode. In this mode, the operating system passes all bytes unchanged.
     ///
     /// # Errors
     /// No pseudo-terminal is available.

@@ -32,7 +32,8 @@ impl Line {
         Self { baud, paced: true }
     }
 
-    /// Returns a line without added delays.
+    /// Returns a line that adds no transmission time to a frame. It is meant for a real serial port, which needs this
+    /// time itself. `baud` is the speed in bit/s; the silence between two frames still depends on it.
     pub fn unpaced(baud: u32) -> Self {
         Self { baud, paced: false }
     }

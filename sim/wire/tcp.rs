@@ -38,9 +38,10 @@ pub async fn serve_tcp(listener: TcpListener, units: Units, faults: SharedFaultP
 }
 
 /// Answers the Modbus TCP requests of one client on `stream`. `units` are the simulated machines with their unit ids.
-/// `faults` are the simulated faults.
+/// `faults` is the plan of the simulated faults.
 ///
-/// Returns `Ok` after a header that is not Modbus TCP, or after a simulated fault has ended the conversation.
+/// Returns `Ok` in three cases: after a header that is not Modbus TCP, after a simulated fault has closed the
+/// connection, or when the client disconnects after a simulated fault has stopped all answers.
 ///
 /// # Errors
 /// The stream cannot be read or written any more, for example because the client has disconnected.

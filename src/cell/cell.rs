@@ -196,8 +196,9 @@ impl Cell {
     /// have changed in the meantime. There are three rules:
     ///
     /// - START and RESUME cause motion. They are executed only if the cell is still in the state that issued them.
-    /// - While the run is ending or has ended, only commands that belong to the ending, and announcements of a
-    ///   judgement, are executed.
+    /// - If the run is ending, only two kinds of command are executed: those that belong to the way in which it ends
+    ///   (for example ABORT while the cell is aborting, or STOP while it is stopping), and the announcement of a
+    ///   verdict. If the run has ended, only the announcement of a verdict is executed.
     /// - Every other command is executed.
     pub fn still_requires(&self, command: &Command) -> bool {
         let at = |device, step| self.state.phase() == Some(Phase::from_job(device, step));

@@ -47,13 +47,14 @@ impl RecordedInterval {
         3.090_232_306_167_813_5,
     ];
 
-    /// Returns the interval from `median_mm - expanded_mm` to `median_mm + expanded_mm`, for a normally distributed
-    /// figure. `expanded_mm` is the expanded uncertainty (k = 2) of the figure.
+    /// Returns the interval from `median_mm - expanded_mm` to `median_mm + expanded_mm`. `median_mm` is the value of a
+    /// figure (such as PV or RMS), and `expanded_mm` is the expanded uncertainty (k = 2) of this figure. The figure is
+    /// treated as normally distributed.
     pub fn from_expanded(median_mm: f64, expanded_mm: f64) -> Self {
         Self { median_mm, low_mm: median_mm - expanded_mm, high_mm: median_mm + expanded_mm, quantiles_mm: None }
     }
 
-    /// Returns the expanded uncertainty (k = 2): half of the width of the interval.
+    /// Returns the expanded uncertainty (k = 2) of the figure, in mm. This is half of the width of the interval.
     pub fn expanded_mm(&self) -> f64 {
         0.5 * (self.high_mm - self.low_mm)
     }

@@ -37,11 +37,13 @@ impl Figures {
         all.iter().all(|figure| figure.is_finite() && *figure >= 0.0) && form.into_iter().all(|of| of.is_valid())
     }
 
-    /// Returns the credible intervals of the peak to valley (PV) and of the root mean square (RMS), in this order.
-    /// `pv_of` selects the PV: PV 99.8 % or the PV of all points.
+    /// Returns two results: the credible intervals of the figures that are judged, and a flag.
     ///
-    /// The flag is true if the first interval is the PV 99.8 %. It is false if the first interval is the PV of all
-    /// points, which is also used if no PV 99.8 % was computed.
+    /// The first interval belongs to the peak to valley (PV), and the second one to the root mean square (RMS). `pv_of`
+    /// selects the PV: PV 99.8 % or the PV of all points. If no PV 99.8 % was computed, the PV of all points is used.
+    ///
+    /// The flag is true if the first interval belongs to the PV 99.8 %, and false if it belongs to the PV of all
+    /// points.
     fn judged_intervals(&self, pv_of: PvPoints) -> ([RecordedInterval; 2], bool) {
         match &self.form {
             Some(form) if pv_of == PvPoints::MostPoints => ([form.pv_robust, form.rms], true),
@@ -117,7 +119,8 @@ impl ComparedFigure {
     }
 }
 
-/// Formats a probability for people, in percent. Rounds down, so that the probability is never overstated.
+/// Formats `probability` (0 to 1) for people, in percent with one decimal, for example "84.1 %". Rounds down, so that
+/// the text never states more than the probability.
 fn format_percent(probability: f64) -> String {
     format!("{:.1} %", 0.1 * (1e3 * probability + 1e-6).floor())
 }
@@ -184,14 +187,15 @@ impl Tolerance {
 ///
 /// The rules are checked in this order, and the first rule that applies gives the verdict:
 ///
-/// - The part is in tolerance. If it exceeds a limit with the outliers included, the verdict is `LeftOut`, otherwise
-///   `Accept`.
-/// - The removal budget leaves no room for another pass.
-/// - The maximum number of passes is reached.
-/// - The part responded wrongly to the last map.
-/// - A figure is worse than in the last judged cycle.
-/// - The figures have not improved enough since the last judged cycle.
-/// - Otherwise, the expected improvement by another pass decides.
+/// - The part is proven in tolerance. The verdict is `Accept`. If the part exceeds a limit when the outliers are
+///   included, the verdict is `LeftOut`.
+/// - Another pass of the minimum depth would exceed the removal budget (the total removal that the plan allows):
+///   `BudgetSpent`.
+/// - The maximum number of passes was begun: `MaxCycles`.
+/// - The part responded wrongly to the last correction map, for example with the opposite sign: `WrongResponse`.
+/// - The PV or the RMS is more than 1.05 times the value of the last judged cycle: `Diverging`.
+/// - Neither the PV nor the RMS has improved enough since the last judged cycle: `Stalled`.
+/// - Otherwise, the expected improvement by another pass decides: `Continue`, `Undecided` or `Stalled`.
 pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, passes: u32) -> ReasonedVerdict {
     let tell = |verdict, reason| ReasonedVerdict { verdict, reason };
     let figures = figures_in_words(plan, now);
@@ -246,15 +250,20 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
     judge_next_pass(plan, before, now, conformity)
 }
 
-/// Returns the verdict on another pass, from the RMS that is expected after this pass. `now` are the figures of the
-/// present cycle. `conformity` is the conformity of the part.
+/// Returns the verdict on another pass. The verdict depends on the RMS that is forecast after this pass. `now` are the
+/// figures of the present cycle, and `before` are those of the last judged cycle. `conformity` is the conformity of the
+/// part.
 ///
-/// The verdict is `Continue` if the expected improvement of the RMS exceeds the stall limits of `plan` (`stall_mm`, and
-/// the share `stall_share` of the RMS). It is also `Continue` if there is no forecast, or if no cycle was judged before
-/// (`before` is `None`). In all other cases the verdict is `Undecided` if the conformity is undecided, or else
+/// The verdict is `Continue` in two cases:
+///
+/// - There is no forecast, or no cycle was judged before (`before` is `None`).
+/// - The forecast improvement of the RMS is more than the limits in `plan`: `stall_mm`, and the share `stall_share` (0
+///   to 1) of the present RMS. In addition, the present RMS must exceed the lower bound in the forecast by more than
+///   the expanded uncertainty of the RMS. This lower bound is the lowest RMS that further corrections can reach. If it
+///   is unknown, only the limits in `plan` count.
+///
+/// Otherwise, no improvement is expected. The verdict is then `Undecided` if the conformity is undecided, or else
 /// `Stalled`.
-///
-/// No improvement is expected if the RMS exceeds its known lower bound by no more than its expanded uncertainty.
 fn judge_next_pass(
     plan: &CellPlan,
     before: Option<&Figures>,
@@ -284,13 +293,16 @@ fn judge_next_pass(
     tell(verdict, format!("no improvement expected, {so_far}: {figures}; {expected}"))
 }
 
-/// Returns the conformity of the part: the worse one of its judged peak to valley and its judged RMS.
+/// Returns the conformity of the part with its limits. This is the worse one of two values: the conformity of the
+/// judged peak to valley, and that of the judged RMS. `now` are the figures of the part. The order from good to bad is
+/// `Within`, `Undecided`, `Beyond`.
 fn conformity(plan: &CellPlan, now: &Figures) -> Conformity {
     let [pv, rms] = plan.tolerance.compare(now);
     pv.conformity.max(rms.conformity)
 }
 
-/// Returns the medians of the two figures that are judged: peak to valley and RMS.
+/// Returns two medians in mm: that of the judged peak to valley and that of the RMS, in this order. The tolerance in
+/// `plan` selects the judged peak to valley: PV 99.8 % or the PV of all points.
 fn judged_medians_mm(plan: &CellPlan, figures: &Figures) -> [f64; 2] {
     plan.tolerance.compare(figures).map(|compared| compared.median_mm)
 }
@@ -323,8 +335,9 @@ pub(super) fn best_in_words(plan: &CellPlan, cycle: u32, figures: &Figures) -> S
     )
 }
 
-/// Returns a text for people that describes a wrong response of the part to the map. Returns `None` if the response is
-/// as expected or unclear.
+/// Returns a text for people if the part responded wrongly to the last correction map. A response is the change of the
+/// surface by the pass that used this map. It is wrong, for example, if it has the opposite sign or is twice as large
+/// as expected. Returns `None` if the response is as expected or unclear.
 fn wrong_response(response: PartResponse) -> Option<&'static str> {
     match response {
         PartResponse::Expected | PartResponse::Unclear => None,

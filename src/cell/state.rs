@@ -92,7 +92,8 @@ pub enum Phase {
 }
 
 impl Phase {
-    /// Returns the phase of a step in the job of a machine.
+    /// Returns the phase in which the machine `device` is at the step `step` of its job. This is `Measure(step)` for
+    /// the CMM and `Grind(step)` for the grinder.
     pub(super) fn from_job(device: Device, step: JobStep) -> Self {
         match device {
             Device::Cmm => Self::Measure(step),

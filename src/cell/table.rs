@@ -100,9 +100,11 @@ pub fn transition_table() -> Vec<TransitionRow> {
         .collect()
 }
 
-/// Returns a key that contains everything in `cell` on which its reactions to the sample events depend. It contains no
-/// times, and counts only as far as they change a reaction. [`transition_table`] examines only one of several cells
-/// with equal keys.
+/// Returns a key for comparing cells: two cells with equal keys react in the same way to all sample events.
+/// [`transition_table`] therefore examines only one of several cells with equal keys.
+///
+/// The key contains no times and no exact counts. A count is replaced by the fact that matters, for example whether the
+/// maximum number of passes is reached.
 fn behaviour_key(cell: &Cell) -> impl Eq + Hash + use<> {
     let known = cell.machines.map(|known| (known.ready, known.was_connected && known.abort_confirmed));
     let clear = cell.machines.map(|known| (known.clear, known.clear_confirmed, known.clear_requested));

@@ -63,9 +63,9 @@ impl Cell {
         }
     }
 
-    /// Resets the [`FailureSeries`] (failures in a row) of the machine `device`, which has made progress. Withdraws the
-    /// alarm [`AlarmId::FailsAgain`] if people were notified of this series and the other machine has no series of
-    /// which people were notified.
+    /// Resets the [`FailureSeries`] (failures in a row) of the machine `device`, which has made progress. If the cell
+    /// had raised the alarm [`AlarmId::FailsAgain`] for this series, also withdraws the alarm. The alarm remains if the
+    /// other machine has a series for which it was raised.
     fn reset_failures(&mut self, device: Device) {
         let was_told = std::mem::take(&mut self.failure_series[device as usize]).reported;
         if was_told && !self.failure_series.iter().any(|vain| vain.reported) {
@@ -73,9 +73,10 @@ impl Cell {
         }
     }
 
-    /// Adds a failure at the present time to the [`FailureSeries`] (failures in a row) of the machine `device`. Begins
-    /// a new series if the last failure was too long ago: more than twice the time limit `vain` of the plan, or more
-    /// than half of `vain` while the cell executes the job of this machine.
+    /// Adds a failure at the present time to the [`FailureSeries`] (failures in a row) of the machine `device`. `vain`
+    /// in the deadlines of the plan is the maximum duration of such a series. Begins a new series if the last failure
+    /// was too long ago. This is the case after more than twice `vain`, or after more than half of `vain` if the
+    /// machine is running its job.
     ///
     /// Returns true if the cell must stop retrying. This is the case if the series has the maximum number of failures,
     /// `vain_failures`. It is also the case if the series has at least [`MIN_RECURRING_FAILURES`] failures and lasts at
@@ -1432,7 +1433,8 @@ pub(super) fn reconciling_device(state: State) -> Option<Device> {
     }
 }
 
-/// Formats the reason that a person gave, as ", because ...". Returns an empty string if there is none.
+/// Returns the text ", because " with `reason` after it. `reason` is the reason that a person gave. Returns an empty
+/// string if `reason` is empty.
 pub(super) fn reason_clause(reason: &str) -> String {
     if reason.is_empty() { String::new() } else { format!(", because {reason}") }
 }

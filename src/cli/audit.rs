@@ -218,13 +218,16 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     }
 }
 
-/// Returns true if a verified journal is complete. Returns false if its run is still active, so that the end is missing
-/// for good reason. `keys` are the public keys that the user trusts. The slice can be empty.
+/// Returns true if a verified journal is complete: the run has its end record, and the end is signed if the run has a
+/// key. Returns false if the run is still active and its end is therefore missing or not signed yet. `keys` are the
+/// public keys that the user trusts. The slice can be empty.
 ///
 /// Returns an error, with a text that names the fault, in three cases:
 ///
-/// - The end of the run is not signed, although the run has a key.
-/// - The anchor file is missing, so that a cut of the end cannot be detected.
+/// - The end of the run is not signed, although the run has a key. If `keys` is empty, this is no error while the run
+///   is still active.
+/// - The anchor file is missing. This file states the number of records. Without it, records can be removed from the
+///   end and nobody can detect this.
 /// - The run was interrupted and has no end.
 pub(super) fn is_whole(verified: &Verified, keys: &[PublicKey]) -> Result<bool, &'static str> {
     match verified {
@@ -242,7 +245,8 @@ pub(super) fn is_whole(verified: &Verified, keys: &[PublicKey]) -> Result<bool, 
     }
 }
 
-/// Returns true if a folder contains runs and is not a run itself.
+/// Returns true if `folder` contains at least one run folder and is not a run folder itself. A run folder is a folder
+/// that contains a journal.
 fn is_folder_of_runs(folder: &Path) -> bool {
     let has_record = |folder: &Path| folder.join(DATABASE).exists();
     !has_record(folder) && folders(folder).any(|run| has_record(&run))

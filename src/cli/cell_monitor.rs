@@ -45,9 +45,11 @@ impl CellMonitor {
         }
     }
 
-    /// Reads the status of the cell again and returns it. Asks the active run, or reads the records if no run is
-    /// active. Returns the last known status if the records cannot be read, or if the run has not answered for less
-    /// than 5 s. After this time, the status is `Unresponsive`.
+    /// Updates the status of the cell and returns it. If a run is active, asks this run. Otherwise, reads the records
+    /// of the runs.
+    ///
+    /// Keeps the last known status if the records cannot be read at the moment, or if the run does not answer. If the
+    /// run has not answered for more than 5 s, the status becomes `Unresponsive`.
     pub(super) fn poll(&mut self) -> &CellStatus {
         let live = control::live_runs(&self.runs).next();
         match live {

@@ -132,8 +132,8 @@ fn has_table(path: &Path, heads: &[&str]) -> bool {
     read.is_ok() && text.lines().any(|line| heads.iter().any(|head| line.trim_start().starts_with(head)))
 }
 
-/// Reads the nominal surface and the measuring plan that a recipe names. Returns the problems of all files that cannot
-/// be used.
+/// Reads the files of the nominal surface and of the measuring plan, if `recipe` names such files. Returns `Ok` if all
+/// these files can be used. Returns an error with the problems of all files that cannot be used.
 fn check_files(recipe: &Recipe) -> Result<(), Problems> {
     let mut problems: Option<Problems> = None;
     let mut add = |key: &str, failure: &dyn std::fmt::Display| {

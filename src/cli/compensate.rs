@@ -134,8 +134,12 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns a text for people about the corrected program `amended`: numbers of moves and arcs, largest displacement in
-/// µm, length outside the map, and an assumed unit. The last two lines appear only if they apply.
+/// Returns a text for people about the corrected program `amended`, with up to three lines:
+///
+/// - The numbers of moves and arcs, and the largest displacement of a point, in µm.
+/// - The length of the path that is outside the correction map, in mm. This line is omitted if the length is 0.
+/// - A note that the program states no unit and that millimetres are assumed. This line is omitted if the program
+///   states its unit.
 fn summary(amended: &Amended) -> String {
     let mut text = format!(
         "{} straight moves and {} arcs became {} moves, including {} arcs; each point moved by at most {} µm\n",
@@ -165,7 +169,7 @@ const LEVEL_OFF_NODES: f64 = 5.0;
 /// Reads the nominal surface in `file` and returns it as a target surface without a correction. `table` is the format
 /// of the file if the file is a table of points.
 ///
-/// Returns an error if the file cannot be read, or if the surface is not a height over x and y.
+/// Returns an error if the file cannot be read, or if the surface cannot be written as a height z = f(x, y).
 fn ground(file: &std::path::Path, table: &Table) -> Result<TargetSurface, Failure> {
     let surface = nominal::surface(file, PlaneProjection::Auto, table)?;
     let failed = |source| Failure::Path { path: file.to_owned(), source };

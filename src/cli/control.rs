@@ -16,8 +16,8 @@ use super::failure::Failure;
 use super::show::{how_far, limits, preview_text, pv_name};
 use super::words::time_left;
 
-/// Returns the text that the help of an order (a command to a running cell) shows at its end. The text explains the
-/// default run, lists the exit codes, and contains `example`, an example command line.
+/// Returns the text at the end of the help of an order (a command to a running cell). The text explains which run is
+/// used if the person names none, lists the exit codes, and contains `example`, an example command line.
 pub(super) fn help(example: &str) -> String {
     format!(
         "\
@@ -129,8 +129,10 @@ fn named_map(arguments: &Confirmation) -> Result<Option<String>, Failure> {
     }
 }
 
-/// Returns the absolute path of the file that the person names in a confirmation, because the cell can run in another
-/// folder. Returns `None` if no file is named, and an error if the file does not exist.
+/// Returns the absolute path of the file that a person names in the confirmation `arguments`. The path must be
+/// absolute, because the cell can run in another folder.
+///
+/// Returns `None` if no file is named. Returns an error if the file does not exist.
 fn named_file(arguments: &Confirmation) -> Result<Option<PathBuf>, Failure> {
     let absolute =
         |path: &PathBuf| path.canonicalize().map_err(|source| Failure::NoFile { path: path.clone(), source });
@@ -178,8 +180,8 @@ fn socket_beside_lock(folder: &Path) -> Option<PathBuf> {
     runs_holding_machines().find(|(of, _)| is_same(of, &run)).map(|(_, door)| door)
 }
 
-/// Returns the runs on this computer whose cells have locked machines and listen for requests. Each entry contains the
-/// run folder and the path of the control socket next to the lock file of a machine.
+/// Returns the runs on this computer that have locked machines and whose cell listens for requests. Each entry contains
+/// two paths: the run folder, and the control socket of the run. This socket is next to the lock file of a machine.
 fn runs_holding_machines() -> impl Iterator<Item = (PathBuf, PathBuf)> {
     MachineLock::control_sockets().into_iter().filter(|(_, door)| is_live_at(door))
 }

@@ -111,8 +111,11 @@ fn in_words(finding: &Finding) -> String {
     format!("{mark:<9}{what}: {words}\n")
 }
 
-/// Checks that runs can be written to the folder `runs`, and that its disk has at least 1 GiB of free space. A missing
-/// folder is created for the check and removed again.
+/// Checks the folder `runs`, in which the runs are stored, and returns the result. The result is an obstacle if no file
+/// can be written to the folder. The result is a notice if the disk of the folder has less than 1 GiB of free space.
+/// Otherwise the result is good and states the free space in GB.
+///
+/// If the folder is missing, creates this folder for the check and removes it again.
 fn folder(runs: &Path) -> Finding {
     const LITTLE_BYTES: u64 = 1 << 30;
     // A missing folder is created, tested, and removed again.
@@ -220,10 +223,13 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
     ]
 }
 
-/// Checks the connection to a machine that is a server, and returns the result. Locks the machine against other runs,
-/// opens a session, requests the identity and the status, and closes the session. Starts no job on the machine. `kind`
-/// and `link` are the kind of the machine and the settings of its connection. `made` is the driver of the machine, or
-/// the error if the driver could not be created.
+/// Checks the connection to a machine whose controller is a network server (I++ DME or LinuxCNC), and returns the
+/// result. Locks the machine against other runs, opens a session, requests the identity and the status, and closes the
+/// session. Starts no job on the machine.
+///
+/// `kind` is the kind of the machine, and `link` the settings of its connection. `made` is the driver of the machine,
+/// or the error if the driver could not be created. The result is an obstacle if the driver or a request fails. The
+/// result is a notice if the lock is not available.
 async fn server<M: Machine>(kind: MachineKind, link: &LinkConfig, made: Result<M, DriverError>) -> Finding {
     let what = match kind {
         MachineKind::Cmm => Device::Cmm,

@@ -256,7 +256,12 @@ impl Failure {
         }
     }
 
-    /// Returns the exit code of the program.
+    /// Returns the exit code of the program for this failure:
+    ///
+    /// - 1: a check has failed, for example because a record is broken or incomplete, or a copy differs from its
+    ///   record, or work is unfinished.
+    /// - 2: an argument, a recipe or data are invalid.
+    /// - 3: a machine or the program has a fault.
     pub(super) fn exit_code(&self) -> u8 {
         match self {
             Self::NotFinite { .. }

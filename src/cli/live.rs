@@ -64,8 +64,11 @@ impl RunContext<'_> {
         Ok(Machines { cmm, grinder, taken })
     }
 
-    /// Executes the prepared run on `machines` until it ends, shows its progress, and writes its report. An error while
-    /// the report is written is only printed.
+    /// Executes the prepared run `work` on `machines`, and shows its progress until the run ends. Then writes the
+    /// report of the run. Returns how the run has ended.
+    ///
+    /// Returns an error if the control socket or the signals of the system are not available, or if the output cannot
+    /// be written. If the report cannot be written, prints a message and returns no error.
     pub(super) async fn carry_out(self, machines: Machines, work: PreparedRun) -> Result<Ending, Failure> {
         let (cell, actor) = (self.cell, self.actor);
         let (notices, shown) = mpsc::unbounded_channel();
@@ -129,12 +132,12 @@ async fn go(run: RunInputs, machines: Machines, actor: Actor) -> Result<Ending, 
     Ok(ending)
 }
 
-/// Sends an order to the cell for each Ctrl-C. `actor` is the person at the terminal.
+/// Sends an order to the cell for each Ctrl-C that is pressed at the terminal. `actor` is the person at the terminal.
 ///
-/// - The first Ctrl-C holds the cell at the next safe place.
-/// - A further Ctrl-C aborts the run if the cell is not executing, or if the last hold by Ctrl-C was less than
-///   [`IN_ONE_GO`] ago.
-/// - Otherwise a person has resumed the cell, and Ctrl-C holds the cell again.
+/// - The first Ctrl-C sends the order to hold.
+/// - A later Ctrl-C sends the order to abort if the last order to hold was sent less than [`IN_ONE_GO`] ago, or if the
+///   cell is not executing (for example because the cell is still held).
+/// - Any other Ctrl-C sends the order to hold again. In this case a person has resumed the cell after the last hold.
 async fn heed_ctrl_c(orders: OrderSender, actor: Actor) {
     let mut held_at: Option<Instant> = None;
     while tokio::signal::ctrl_c().await.is_ok() {

@@ -233,7 +233,8 @@ fn remark(text: &str) -> Result<String, String> {
     if text.trim().is_empty() { Ok(String::new()) } else { name(text) }
 }
 
-/// Parses a number above 0, including `inf`.
+/// Parses `text` as a number above 0. Accepts `inf` (infinity). Returns a text with the permitted values if `text` is
+/// not such a number.
 fn above_zero(text: &str) -> Result<f64, String> {
     match text.trim().parse::<f64>() {
         Ok(value) if value > 0.0 => Ok(value),
@@ -241,12 +242,13 @@ fn above_zero(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Parses a finite number above 0.
+/// Parses `text` as a finite number above 0. Returns a text with the permitted values if `text` is not such a number.
 fn finite_above_zero(text: &str) -> Result<f64, String> {
     above_zero(text).and_then(|v| if v.is_finite() { Ok(v) } else { Err("give a finite number above 0".into()) })
 }
 
-/// Parses a finite number, 0 or above.
+/// Parses `text` as a finite number that is 0 or above. Returns a text with the permitted values if `text` is not such
+/// a number.
 fn finite_from_zero(text: &str) -> Result<f64, String> {
     match text.trim().parse::<f64>() {
         Ok(value) if value >= 0.0 && value.is_finite() => Ok(value.abs()),

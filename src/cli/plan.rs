@@ -207,9 +207,10 @@ impl ScallopsDocument {
         Self { pv_um, rms_um, mean_um, allowed_pv_um, allowed_rms_um }
     }
 
-    /// Returns a text for each tolerance (PV or RMS) of which the scallops use more than the share
-    /// [`MAX_SCALLOP_SHARE`]. A scallop is the ridge between two tracks of the wheel. An example of a text is "40 % of
-    /// acceptance.pv_um".
+    /// Compares the scallops (the ridges between two tracks of the wheel) with the PV tolerance and the RMS tolerance.
+    /// Returns one text for each tolerance of which the scallops use more than the share [`MAX_SCALLOP_SHARE`]. The
+    /// text states the used share and the recipe key, for example "40 % of acceptance.pv_um". Omits a tolerance that
+    /// the recipe does not give.
     fn beyond(&self) -> Vec<String> {
         let taken = [
             ("acceptance.pv_um", self.pv_um, self.allowed_pv_um),

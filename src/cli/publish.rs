@@ -110,9 +110,11 @@ async fn wait_for_lock(config: &PlantConfig, arguments: &Arguments) -> Result<Pu
     }
 }
 
-/// Publishes the state of the cell to all receivers that the plant file `config` names, until the future `ended`
-/// completes or a publisher ends. `cell` is the name under which the cell is published. `turn` is the lock that keeps
-/// other programs from publishing the same cell. Returns an error if a publisher cannot start or fails.
+/// Publishes the state of the cell to all receivers that the plant file `config` names. Ends when the future `ended`
+/// completes or when a publisher ends. `arguments` give the folder of the runs. `cell` is the name under which the cell
+/// is published. `turn` is the lock that keeps other programs from publishing the same cell.
+///
+/// Returns [`Outcome::Accepted`] after an orderly end. Returns an error if a publisher cannot start or fails.
 async fn publish(
     config: &PlantConfig,
     cell: &str,

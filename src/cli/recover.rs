@@ -78,9 +78,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Evaluates the result `home` of the attempt to bring one machine to idle. If `home` is an error, prints this error
-/// and returns false, so that the caller continues with the other machine. Otherwise returns the value in `home`.
-/// Returns an error only if the terminal cannot be used.
+/// Evaluates the result `home` of the attempt to bring one machine to idle. Returns the value in `home`: true if the
+/// machine is idle, false if not. If `home` is an error, prints this error and returns false, so that the caller
+/// continues with the next machine. Returns an error only if the terminal cannot be used.
 fn print_failure(home: Result<bool, Failure>) -> Result<bool, Failure> {
     match home {
         Err(failure @ Failure::Terminal(_)) => Err(failure),
@@ -167,9 +167,9 @@ impl Recovery {
         }
     }
 
-    /// Returns the path of the folder of the interrupted run with the job number `job`, from the runs in the same
-    /// folder as this recovery. The job number identifies a run at the machines. An interrupted run has a record
-    /// without an end. Returns `None` if no such run is found.
+    /// Finds the interrupted run that has the job number `job`, and returns the path of its folder. The machines
+    /// identify a run by its job number. A run is interrupted if its record contains no end. Searches the folder of the
+    /// runs, without the folder of this recovery. Returns `None` if no such run is found.
     fn run_of(&self, job: u32) -> Option<String> {
         let is_open = |folder: &PathBuf| -> Option<bool> {
             let reader = Reader::open(folder).ok()?;

@@ -136,8 +136,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns the method of the registration: `Contact` if the argument is a probe radius of 0, because such points are on
-/// the surface itself; otherwise the method of the arguments.
+/// Returns the method of the registration. The method is [`Method::Contact`] (the measured points lie on the surface
+/// itself) if the arguments give a probe radius of 0. Otherwise the method is the one that the arguments name.
 fn method(arguments: &Arguments) -> Method {
     if arguments.probe_radius == Some(0.0) { Method::Contact } else { arguments.method }
 }
@@ -167,9 +167,11 @@ fn options(arguments: &Arguments) -> Result<RegistrationOptions, Failure> {
     })
 }
 
-/// Reads the nominal file and the measured file that `arguments` name, in parallel. Returns the nominal surface, and
-/// the measured points with the notes about them. Returns an error if a file is invalid. Also returns an error if the
-/// measured file is a map of heights (X3P, SDF or MetroPro) and the method of the registration is not `Contact`.
+/// Reads the nominal file and the measured file that `arguments` name, in parallel. Returns the nominal surface and the
+/// measured points. The points contain notes about doubtful lines, for example a last line without a line end.
+///
+/// Returns an error if a file is invalid. Also returns an error if the measured file is a height map (X3P, SDF or
+/// MetroPro) and the method of the registration is not `Contact`.
 fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure> {
     let (path, projection) = (&arguments.nominal, arguments.projection);
     if is_map(&arguments.measured)? && method(arguments) != Method::Contact {

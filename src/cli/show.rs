@@ -374,8 +374,9 @@ pub(super) fn limits(tolerance: &Tolerance) -> String {
 }
 
 /// Returns the gains as text with two decimals. A gain is the share of the newest error that the next correction
-/// compensates. Each pair in `gains` belongs to a band of wavelengths, and its second number is the gain. If the gains
-/// differ by less than 0.005, the text is one value; otherwise it is the range from the minimum to the maximum.
+/// removes; 1 means all of it. Each pair in `gains` contains the shortest wavelength of a wavelength range in mm and
+/// the gain in this range. If the gains differ by less than 0.005, the text is the largest gain. Otherwise the text is
+/// the range from the smallest to the largest gain.
 fn gains(gains: &[[f64; 2]]) -> String {
     let least = gains.iter().map(|gain| gain[1]).fold(f64::INFINITY, f64::min);
     let most = gains.iter().map(|gain| gain[1]).fold(0.0, f64::max);

@@ -90,8 +90,10 @@ pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec
 
 /// Starts servers for the simulated machines of the cell `cell`, at the addresses in the cell file. `spec` defines the
 /// simulated part and machines. If a port is 0, the system assigns a free port, which is then stored in `cell`. The
-/// simulated probe with I++ DME or hit lines, and the simulated wheel of LinuxCNC, have the radii in `recipe`. The
 /// servers end when the returned value is dropped.
+///
+/// `recipe` gives two radii. A simulated measuring machine that uses I++ DME, or prints one line for each touch, has
+/// the probe radius of `recipe`. A simulated grinder that uses LinuxCNC has the wheel radius of `recipe`.
 ///
 /// # Errors
 /// Returns an error if an address is not available, or if this machine or recipe cannot be simulated.
@@ -158,10 +160,11 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
     Ok(simulated)
 }
 
-/// Starts the external controller with `command`, and returns the path on which the controller moves the simulated
-/// wheel. The wheel grinds the part in `world`, and has the radius in `recipe`. Returns the reason as text if `recipe`
-/// requires a tilted wheel, a wheel that is not a sphere, or a pattern other than parallel tracks along x. Also returns
-/// the reason if `command` cannot be started.
+/// Starts the external controller with `command`, and returns the path on which this controller moves the simulated
+/// wheel. The wheel grinds the part in `world`, and has the radius in `recipe`.
+///
+/// Returns the reason as text if `recipe` requires a tilted wheel, a wheel that is not a sphere, or tracks that are not
+/// parallel lines along x. Also returns the reason if `command` cannot be started.
 fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<ExecutedPath, String> {
     let grinding = &recipe.grinding;
     if grinding.tilt.is_some() {
@@ -180,9 +183,12 @@ fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<Executed
     })
 }
 
-/// Returns the settings with which the simulated grinder reads grinding programs: the program folder, the control for
-/// the dialect in the cell file, and the rotary axis of the wheel. Returns `None` if the cell file names no program
-/// folder. Returns the reason as text if no simulated control reads the dialect.
+/// Returns the settings with which the simulated grinder reads grinding programs. The settings are the program folder,
+/// the kind of the simulated control, and the rotary axis of the wheel. The kind follows from the dialect (the program
+/// format of a machine control) in the cell file.
+///
+/// Returns `None` if the cell file names no program folder. Returns the reason as text if no simulated control reads
+/// this dialect.
 fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
     let program = &cell.grinder.program;
     let Some(folder) = program.folder.clone() else { return Ok(None) };

@@ -221,10 +221,16 @@ impl Proof {
             .push(json!({ "number": place.map(|place| place.number), "run": name, "stands": stands, "words": words }));
     }
 
-    /// Checks that a run follows the run `last` in the sequence, and adds each fault to the list of flaws. The number
-    /// of the run must be one higher than the number of `last`, or 1 if `last` is `None`. `before` is the state of the
-    /// previous run, as stored in the checked run: its name, number of records and last hash. If `before` is given, the
-    /// name of `last` must be the same, and the record of `last` with this number must still have this hash.
+    /// Checks that a run follows the run `last` in the sequence of runs, and adds each fault to the list of flaws. The
+    /// checked run is given by its number and its folder. `last` is the run before it in the sequence, also with number
+    /// and folder; `None` means that there is none. `before` is the information about the previous run that the checked
+    /// run has stored: name, number of records, and hash of the last record.
+    ///
+    /// The number of the checked run must be the number of `last` plus 1, or 1 if `last` is `None`. If the number is
+    /// correct and both `before` and `last` are given, also checks `last`:
+    ///
+    /// - The name of `last` must be the stored name.
+    /// - The stored number of records is the number of a record in `last`. This record must have the stored hash.
     fn follows(&mut self, (number, folder): (u64, &Path), before: Option<&Before>, last: Option<(u64, &Path)>) {
         let name = name_of(folder);
         let due = last.map_or(1, |(last, _)| last.saturating_add(1));

@@ -2,7 +2,7 @@
 
 use regrind::cell::ComparedFigure;
 
-/// Returns a count with separated thousands: 451,401.
+/// Returns the number `n` as text, with a comma before each group of three digits, for example "451,401".
 pub(super) fn count(n: usize) -> String {
     let digits = n.to_string();
     let mut text = String::new();
@@ -15,7 +15,8 @@ pub(super) fn count(n: usize) -> String {
     text
 }
 
-/// Returns a count with its noun: 1 point, 2 points.
+/// Returns the number `n` followed by `noun`, which is a word in the singular. Adds an "s" to the word if `n` is not 1,
+/// for example "1 point" and "2 points". Puts a comma before each group of three digits of the number.
 pub(super) fn counted(n: usize, noun: &str) -> String {
     format!("{} {noun}{}", count(n), if n == 1 { "" } else { "s" })
 }
@@ -34,8 +35,9 @@ pub(super) fn three_digits(value: f64) -> String {
     format!("{value:.*}", (3 - before_point).max(0) as usize)
 }
 
-/// Formats a judged figure for people: its name, its value in µm, its limit in µm, and the probability that the value
-/// is within the limit. Omits limit and probability if the figure has no limit.
+/// Returns a text about one compared figure, such as PV or RMS. The text states the name of the figure, its median in
+/// µm, its limit in µm, and the probability that the figure is within the limit. Omits the limit and the probability if
+/// the figure has no limit.
 pub(super) fn judged(compared: &ComparedFigure) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let ComparedFigure { name, median_mm: found_mm, limit_mm, .. } = compared;

@@ -26,8 +26,11 @@ pub fn dialects() -> impl Iterator<Item = &'static str> {
     BUILT_IN_DIALECTS.iter().map(|(name, _)| *name)
 }
 
-/// Returns the path of a dialect file. `dialect` is the path as written in the cell file; it is resolved against the
-/// folder of the cell file `cell`. Returns `None` if `dialect` is the name of a built-in dialect.
+/// Returns the path of the dialect file that the cell file `cell` names. A dialect is the program format of a machine
+/// control. `dialect` is the text in the cell file: the name of a built-in dialect, or a path. A relative path is
+/// resolved against the folder of `cell`.
+///
+/// Returns `None` if `dialect` is the name of a built-in dialect, because there is no file for it.
 pub(super) fn dialect_path(dialect: &str, cell: &Path) -> Option<PathBuf> {
     let is_built_in = dialects().any(|name| name == dialect);
     (!is_built_in).then(|| cell.parent().unwrap_or(Path::new("")).join(dialect))
@@ -46,19 +49,21 @@ pub(super) fn read_named_dialect(dialect: &str, cell: &Path) -> Result<Dialect, 
     }
 }
 
-/// Reads a dialect file. Returns the dialect and the SHA-256 of its text.
+/// Reads a dialect file. A dialect is the program format of a machine control. Returns the dialect and the SHA-256 of
+/// the text of the file.
 ///
 /// # Errors
-/// Returns an error if the file cannot be read, and all errors of its text.
+/// Returns an error if the file cannot be read. Otherwise returns all errors found in its text.
 pub fn read_dialect(path: &Path) -> Result<(Dialect, [u8; 32]), Problems> {
     let text = read_text(path)?;
     parse_dialect(path, &text)
 }
 
-/// Parses a dialect from its text. Returns the dialect and the SHA-256 of the text. `path` is used in messages.
+/// Parses a dialect (the program format of a machine control) from the content `text` of its file. Returns the dialect
+/// and the SHA-256 of `text`. `path` is the path of the file and appears only in error messages.
 ///
 /// # Errors
-/// Returns all errors of the text.
+/// Returns all errors found in the text.
 pub fn parse_dialect(path: &Path, text: &str) -> Result<(Dialect, [u8; 32]), Problems> {
     let mut document = Document::parse(path, text)?;
     document.check_schema(&SCHEMA);

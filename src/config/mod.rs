@@ -205,10 +205,11 @@ pub fn json_schema() -> &'static serde_json::Value {
 }
 
 impl CellConfig {
-    /// Reads a cell file. [`BUILT_IN_CELL`] is not a file; it names the built-in simulated cell.
+    /// Reads the cell file at `path`, and returns its checked settings. If `path` is [`BUILT_IN_CELL`], reads no file
+    /// and returns the settings of the simulated cell that is built into the program.
     ///
     /// # Errors
-    /// Returns an error if the file cannot be read, and all errors of its text.
+    /// Returns an error if the file cannot be read. Otherwise returns all errors found in its text.
     pub fn read(path: &Path) -> Result<Self, Problems> {
         if path == Path::new(BUILT_IN_CELL) {
             return Self::parse(path, include_str!("../../config/sim.toml"));
@@ -257,7 +258,9 @@ impl CellConfig {
         &self.renamed
     }
 
-    /// Returns true if every record is marked SIMULATION: the machines are simulated, or the run is a rehearsal.
+    /// Returns true if all records of the runs of this cell carry the mark SIMULATION. This is the case if the machines
+    /// are simulated. This is also the case in a rehearsal (a run in which people act as the machines and no part
+    /// exists).
     pub fn is_marked_simulation(&self) -> bool {
         self.simulated || self.rehearsal
     }

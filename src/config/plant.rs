@@ -75,10 +75,10 @@ pub fn plant_schema() -> &'static serde_json::Value {
 }
 
 impl PlantConfig {
-    /// Reads a plant file.
+    /// Reads the plant file at `path`, and returns its checked settings.
     ///
     /// # Errors
-    /// Returns an error if the file cannot be read, and all errors of its text.
+    /// Returns an error if the file cannot be read. Otherwise returns all errors found in its text.
     pub fn read(path: &Path) -> Result<Self, Problems> {
         Self::parse(path, &read_text(path)?)
     }

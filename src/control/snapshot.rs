@@ -212,8 +212,9 @@ pub struct CycleRow {
 }
 
 impl CycleRow {
-    /// Returns `[PV, RMS]` of a cycle in µm, as they are judged against the limits. If no judged value exists for one
-    /// of them, returns the value of all points that the registration used instead.
+    /// Returns `[PV, RMS]` of this cycle in µm, the two values that are compared with the limits. If the cycle has no
+    /// separate judged PV, the first value is the PV of all used points. If the cycle has no separate judged RMS, the
+    /// second value is the RMS of all used points. The used points are the points that the registration has used.
     pub fn judged_um(&self) -> [f64; 2] {
         [self.judged_pv_um.unwrap_or(self.pv_um), self.judged_rms_um.unwrap_or(self.rms_um)]
     }

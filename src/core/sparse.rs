@@ -139,7 +139,8 @@ impl<'a> CholeskyFactor<'a> {
 
 impl SelectedInverse<'_> {
     /// Returns the entry of the inverse in row `a` and column `b` of the original matrix. Returns NaN if the Cholesky
-    /// factor has no entry there; it has one wherever the matrix has one.
+    /// factor has no entry at this position, because such entries of the inverse are not computed. Every position with
+    /// an entry of the original matrix also has an entry of the Cholesky factor.
     pub fn entry(&self, a: usize, b: usize) -> f64 {
         let at = |k: usize| self.pattern.symbolic.perm().map_or(k, |perm| perm.arrays().1[k]);
         let (column, row) = (at(a).min(at(b)), at(a).max(at(b)));

@@ -84,14 +84,16 @@ pub trait DriverFactory {
     /// run.
     const READS_RUN_FOLDER: bool = false;
 
-    /// Checks the table `wire` of a machine, which describes the connection to this machine. Adds each error that the
-    /// schema of the cell file does not detect to the cell file `_document`. `_place` states whether the table belongs
-    /// to the CMM or to the grinder. The default reports no error.
+    /// Checks this table `wire` of the cell file, which describes the connection to one machine. Reports each error
+    /// that the schema of the cell file does not detect. The errors are added to the list of problems in `_document`,
+    /// which is the cell file while it is checked. `_place` states whether the table belongs to the CMM or to the
+    /// grinder. The default reports no error.
     fn check(&self, _place: &MachineTable<'_>, _document: &mut Document) {}
 
-    /// Compares this table `wire`, which belongs to the CMM, with the table `_grinder` of the grinder. Adds each
-    /// conflict, for example a folder that both machines use, to the cell file `_document`. The default reports no
-    /// conflict.
+    /// Compares this table `wire`, which describes the connection to the CMM, with the table `_grinder`, which
+    /// describes the connection to the grinder. Reports each conflict, for example a folder that both machines use. The
+    /// conflicts are added to the list of problems in `_document`, which is the cell file while it is checked. The
+    /// default reports no conflict.
     fn check_against_grinder(&self, _grinder: &Self, _document: &mut Document) {}
 
     /// Returns notes for a person about this connection on this computer, for example that a serial port does not
@@ -146,8 +148,9 @@ pub trait DriverFactory {
         None
     }
 
-    /// Returns the address of the Modbus line and the number of the machine's unit on this line. A simulated machine
-    /// listens at the same address. Returns `None` if the connection is not Modbus.
+    /// Returns the address of the Modbus line and the unit id of the machine on this line. The address is a host and a
+    /// TCP port, or a serial port. If the machine is simulated, the simulator listens at the same address. Returns
+    /// `None` if the connection is not Modbus.
     fn modbus_line(&self) -> Option<(LineAddress, u8)> {
         None
     }

@@ -44,16 +44,18 @@ macro_rules! drivers {
         }
 
         impl Wire {
-            /// Checks this wire (the connection to one machine, from its table in the cell file). Adds each error that
-            /// the schema of the cell file does not detect to the cell file `document`. `place` states whether the wire
-            /// belongs to the CMM or to the grinder.
+            /// Checks this wire (the connection to one machine, from its table in the cell file). Reports each error
+            /// that the schema of the cell file does not detect. The errors are added to the list of problems in
+            /// `document`, which is the cell file while it is checked. `place` states whether the wire belongs to the
+            /// CMM or to the grinder.
             pub fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
                 match self { $(Self::$wire(wire) => DriverFactory::check(wire, place, document)),+ }
             }
 
-            /// Compares this wire (the connection to the CMM) with the wire `grinder`. Adds each conflict, for example
-            /// a folder that both machines use, to the cell file `document`. Reports nothing if the two wires are of
-            /// different kinds.
+            /// Compares this wire (the connection to the CMM) with the wire `grinder` (the connection to the grinder).
+            /// Reports each conflict, for example a folder that both machines use. The conflicts are added to the list
+            /// of problems in `document`, which is the cell file while it is checked. Reports nothing if the two wires
+            /// are of different kinds.
             pub fn check_against_grinder(&self, grinder: &Self, document: &mut Document) {
                 match (self, grinder) {
                     $((Self::$wire(cmm), Self::$wire(grinder)) => DriverFactory::check_against_grinder(cmm, grinder, document),)+
@@ -67,7 +69,8 @@ macro_rules! drivers {
                 match self { $(Self::$wire(wire) => wire.notes()),+ }
             }
 
-            /// Returns true if a person operates the machine.
+            /// Returns true if a person operates the machine on this wire (the connection to one machine). Such a job
+            /// takes as long as the person needs.
             pub fn is_by_person(&self) -> bool {
                 match self { $(Self::$wire(_) => <$table>::BY_PERSON),+ }
             }
@@ -96,8 +99,9 @@ macro_rules! drivers {
                 match self { $(Self::$wire(wire) => wire.coordinates()),+ }
             }
 
-            /// Returns the address of the Modbus line and the number of the machine's unit on this line. Returns `None`
-            /// if this wire is not Modbus.
+            /// Returns the address of the Modbus line and the unit id of the machine on this line. The address is a
+            /// host and a TCP port, or a serial port. Returns `None` if this wire (the connection to one machine) is
+            /// not Modbus.
             pub fn modbus_line(&self) -> Option<(LineAddress, u8)> {
                 match self { $(Self::$wire(wire) => DriverFactory::modbus_line(wire)),+ }
             }

@@ -437,7 +437,8 @@ pub struct SignalValue {
 }
 
 impl SignalValue {
-    /// Returns in words why the value is missing or out of range; `None` if it is good.
+    /// Returns a text for a person that states why the value of this signal is missing or outside of its range. Returns
+    /// `None` if the value is within the range; the limits themselves are allowed.
     pub fn problem(&self) -> Option<String> {
         let Self { name, value, unit, range: [least, most], cause } = self;
         let flaw = match value {

@@ -38,8 +38,9 @@ impl<Load> JobMemory<Load> {
         self.loaded.as_ref().filter(|(_, digest)| *digest == job.digest).map(|(load, _)| Arc::clone(load))
     }
 
-    /// Returns the [`Armed`] of a prepared job, with the next start number. Token and boot id are 0, because this
-    /// machine has none.
+    /// Creates the [`Armed`] of `job`: the prepared job with the sequence number of its start. This number is one above
+    /// the number of the last start. The one-time token and the boot id are 0, because a machine without a memory of
+    /// jobs has neither. Also sets the number of already reported points to 0.
     pub(crate) fn arm(&mut self, job: Job) -> Armed {
         self.reported_points = 0;
         Armed { job, start_sequence: self.last_start_sequence + 1, token: 0, boot_id: 0 }

@@ -81,8 +81,8 @@ pub trait Machine: Send {
     fn clear(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
     /// Reports to the machine that the client has stored the result of a job. The machine may then delete the result.
-    /// `done` is the sequence number of the START whose job ended, as in the status. Returns the status with which the
-    /// machine acknowledges the command.
+    /// `done` is the sequence number of the START that began this job; it is the value `done` in the [`Status`] of the
+    /// machine. Returns the status with which the machine acknowledges the command.
     fn acknowledge(&mut self, done: u32) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
     /// Gives up the ownership of the machine, so that another client can claim it. Returns the status with which the
@@ -95,12 +95,13 @@ pub trait Machine: Send {
     /// Takes a second or more if the answer is "not started": two statuses, at least a second apart, must show this.
     fn reconcile(&mut self, intended: &Armed) -> impl Future<Output = Result<Reconciled, DeviceError>> + Send;
 
-    /// Accepts `_word`, an operator confirmation of a fact that the machine cannot report itself. Returns the paths of
-    /// the files that were stored because of it, relative to the folder of the run.
+    /// Accepts `_word`, an operator confirmation of a fact that the machine cannot report itself, for example that a
+    /// pass has begun. Returns the paths of the files that the driver stored for this confirmation, relative to the
+    /// folder of the run. The list can be empty.
     ///
     /// # Errors
-    /// The confirmation is not expected now. A machine that reports its own state always returns
-    /// [`DeviceError::ConfirmationNotNeeded`].
+    /// Returns an error if no confirmation of this kind is expected in the current state. A machine that reports its
+    /// own state always returns [`DeviceError::ConfirmationNotNeeded`].
     fn confirm(
         &mut self,
         _word: OperatorConfirmation,
@@ -117,12 +118,12 @@ pub trait Cmm: Machine {
     fn load_plan(&mut self, plan: &Plan, interrupt: &Interrupt)
     -> impl Future<Output = Result<(), DeviceError>> + Send;
 
-    /// Reads a few measured points of `_job` while the job still runs. The points are preliminary and only for display.
-    /// Returns the new points. Returns `None` if there are no new points or the machine does not offer this.
+    /// Reads some measured points of `_job` while the job still runs, and returns the new points. They are preliminary
+    /// and serve only for display. Returns `None` if there are no new points, if the machine cannot report points
+    /// early, or if the reading fails. The next call of [`Machine::status`] reports a lost machine.
     ///
-    /// Call it after [`Machine::status`], when no other request is due. Between two calls of the status it does at most
-    /// one short step. It stops if `_interrupt` is raised. It returns no errors; the next call of the status reports a
-    /// lost machine.
+    /// Call this function after [`Machine::status`], when no other request is necessary. Each call does only a short
+    /// part of the transfer, so that the next status is not late. The transfer stops if `_interrupt` is raised.
     fn read_ahead(
         &mut self,
         _job: Job,
@@ -175,22 +176,22 @@ pub trait Grinder: Machine {
 pub struct Interrupt(Arc<AtomicBool>);
 
 impl Interrupt {
-    /// Creates a flag that is not raised.
+    /// Creates an interrupt flag that is not raised, so that transfers can run.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Raises the flag: every transfer that checks it stops.
+    /// Raises the interrupt flag. Every transfer that uses this flag or a clone of it then stops.
     pub fn raise(&self) {
         self.0.store(true, Ordering::Release);
     }
 
-    /// Lowers the flag.
+    /// Lowers the interrupt flag, so that transfers can run again.
     pub fn lower(&self) {
         self.0.store(false, Ordering::Release);
     }
 
-    /// Returns true if the flag is raised.
+    /// Returns true if the interrupt flag is raised, which means that transfers must stop.
     pub fn is_raised(&self) -> bool {
         self.0.load(Ordering::Acquire)
     }

@@ -193,8 +193,9 @@ pub struct PassRecord {
 }
 
 impl PassRecord {
-    /// Returns a pass record without measured values: each of them is `None`. `map_identity` is the SHA-256 of the
-    /// correction map, and `done` is the sequence number of the START that began the job.
+    /// Returns the record of a pass that ended with `outcome` and for which the machine measured no values. Every
+    /// measured value, such as the removed volume, is `None`. `map_identity` is the SHA-256 of the correction map, and
+    /// `done` is the sequence number of the START that began `job`.
     pub(super) fn unmeasured(outcome: super::Outcome, map_identity: [u8; 32], job: super::Job, done: u32) -> Self {
         Self {
             outcome,

@@ -39,11 +39,15 @@ const TOUCH_ALLOWANCE_MM: f64 = 1.0;
 const MAX_SIZE_DIFFERENCE: f64 = 0.02;
 
 impl Plan {
-    /// Checks that a measurement can be the result of this plan. Compares the touched points of the part one by one
-    /// with their targets, after a rigid best fit of all these points. So the position of the part does not matter.
+    /// Checks that `measurement` can be the result of this plan. Fits the planned targets on the part to the touched
+    /// points by one rigid motion, and then compares each point with its target. Therefore the position of the part
+    /// does not matter.
     ///
-    /// Returns `Ok` without the fit if the points determine no fit (fewer than three points, or points on a line). Also
-    /// returns `Ok` if the size of the point set differs by more than 2 % from the plan; other checks report that.
+    /// Returns `Ok` without this comparison in two cases:
+    ///
+    /// - The points determine no fit: there are fewer than three points, or they lie on a line.
+    /// - The size of the point set (root mean square distance from the centroid) differs by more than 2 % from the
+    ///   plan. Other checks report this difference.
     ///
     /// # Errors
     /// - [`PlanMismatch::EqualsPlan`]: all points equal the planned points to their last decimal, so nothing was

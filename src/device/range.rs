@@ -82,10 +82,11 @@ pub(super) fn plausible_status(
     (told.0, told.1, temperature.into_iter().chain(steps).collect())
 }
 
-/// Checks `scale_mm`, the length of one count of a measured point in mm, against its range.
+/// Checks that `scale_mm` is in the range that is physically possible. `scale_mm` is the length in mm of one count, the
+/// unit in which a machine sends coordinates. `machine` is the name of the machine for the error message.
 ///
 /// # Errors
-/// The length is outside of the range.
+/// `scale_mm` is outside the range.
 pub(super) fn check_count_scale(machine: &Arc<str>, scale_mm: f64) -> Result<(), DeviceError> {
     COUNT.refuse(machine, scale_mm)
 }

@@ -379,7 +379,9 @@ fn span_of(root: &DeTable, steps: &[Step]) -> Range<usize> {
     found
 }
 
-/// Returns the position in the text of the name of a key, not of its value.
+/// Returns the position in the text, as a range of bytes, of the name of the key with the path `steps`, not of the
+/// value. For a list entry, which has no name, returns the position of the entry. If the key does not exist, returns
+/// the position of the innermost existing table or list entry around it, or `0..0` if there is none.
 fn span_of_name(root: &DeTable, steps: &[Step]) -> Range<usize> {
     let Some((Step::Key(last), before)) = steps.split_last() else { return span_of(root, steps) };
     let mut inside: Option<&DeValue> = None;

@@ -22,15 +22,20 @@ pub(super) struct TouchEvaluation {
     pub(super) next: Option<(Vec<usize>, &'static str)>,
 }
 
-/// Evaluates an adaptive measurement after a batch of touches. Returns the estimated form, and the indices of the next
-/// targets to touch with the reason. The next targets are `None` if enough is known.
+/// Evaluates an adaptive measurement (targets are touched in batches until enough is known) after one batch. Returns
+/// the estimated form of the part. Also returns the indices of the next targets to touch, with the reason. The next
+/// targets are `None` if no further touch is needed or no target is left.
 ///
-/// `(number, cycle)` is the cycle with its number. `points` are the usable points of all batches so far. `found` is the
-/// registration of these points, and `given` are the inputs of the error model.
+/// `adaptive` contains the rules for the end of the measurement. `(number, cycle)` is the cycle with its number.
+/// `points` are the usable points of all batches so far. `found` is the registration of these points, and `given` are
+/// the inputs of the error model.
 ///
-/// The first batch only shows whether the part is at its expected place. After this batch, the form is an error text,
-/// and the next targets are as many as the first estimate requires. If no model fits the points, the form is the reason
-/// as text, and the next targets are all remaining ones.
+/// There are two special cases:
+///
+/// - After the first batch, no form is estimated. This batch only shows whether the part is at its expected place. The
+///   form is then a text with this reason, and the next targets are as many as the first estimate requires.
+/// - If no model fits the points, the form is a text with the reason, and the next targets are all targets that were
+///   not tried.
 pub(super) fn evaluate_touches(
     task: &Task,
     adaptive: &AdaptiveOptions,
@@ -70,15 +75,20 @@ pub(super) fn evaluate_touches(
     }
 }
 
-/// Plans the repetition of touches that the registration `found` marks as outliers. Returns the outliers, the control
-/// points, the largest allowed change of a control point in mm, and the targets in the model frame. The order of the
-/// targets is: one for each outlier, one for each control point, then up to four around each outlier.
+/// Plans to touch again the points that the registration `found` marks as outliers. Returns the outliers, the control
+/// points (inliers that are touched again to detect a motion of the part), the largest allowed change of a control
+/// point in mm, and the targets in the model frame.
 ///
-/// The targets around an outlier lie on the lines to its nearest inliers. The probe can touch both ends of such a line,
-/// so it can also reach the points between them. The control points are inliers that are as far apart as possible.
-/// `noise_sigma_mm` is the standard deviation of the probe's noise, from which the allowed change follows.
+/// The targets have this order: one for each outlier, then one for each control point, then up to four around each
+/// outlier. The targets around an outlier lie between the outlier and its nearest inliers, in different directions. The
+/// probe can reach such a target, because it has already touched the outlier and the inlier. The control points are as
+/// far apart as possible.
 ///
-/// Returns `None` if the task has no targets, if there is no outlier or more than 20, or if no batch number is left.
+/// `points` are the usable points of the measurement. `noise_sigma_mm` is the standard deviation of the noise of the
+/// probe. It determines the allowed change.
+///
+/// Returns `None` if the task has no targets, if there is no outlier or more than 20, or if outliers were already
+/// touched again so often that no number is left for another batch.
 pub(super) fn plan_repeated_touches(
     task: &Task,
     found: &Registration,

@@ -123,9 +123,11 @@ fn fields(row: &str) -> Vec<&str> {
     .collect()
 }
 
-/// Returns true if a line of a file is a comment about a compensated machine parameter: after the comment sign it
-/// begins with `parameter: `. Two such lines count as equal, because the correction contains the same number and is
-/// compared too.
+/// Returns true if a line of a file is a comment about a compensated machine parameter. Such a line begins with a
+/// comment sign (`#`, `(` or `;`), followed by `parameter: `.
+///
+/// The comparison of two files ignores differences between two such comments. The correction contains the same number,
+/// and the correction is compared too.
 fn is_remark(line: &str) -> bool {
     let comment = line.trim_start().trim_start_matches(['#', '(', ';']).trim_start();
     comment.len() < line.len() && comment.starts_with("parameter: ")

@@ -75,9 +75,10 @@ fn removed_components(task: &Task) -> RemovedParts {
     RemovedParts { motion, filter: format!("waves below {} mm ({smoothing})", task.map_options.cutoff_mm) }
 }
 
-/// Estimates the errors of machine parameters that explain a part of the deviations: radius and setting of the wheel,
-/// tilt of the part, wear. Writes the estimates to `parameters.json` and returns them. If they cannot be estimated,
-/// writes the reason to this file and returns `None`.
+/// Estimates the errors of machine parameters from the deviations of the measured points. The parameters are the radius
+/// of the wheel, the position of the wheel in x, y and z, the tilt of the part in the grinder, and the wear of the
+/// wheel. Writes the estimates to `parameters.json` and returns them. If they cannot be estimated, writes the reason to
+/// this file and returns `None`.
 ///
 /// `contacts` are the measured points with their normals and deviations. `cycle` contains the parameter corrections
 /// with which the measured pass was ground.
@@ -101,8 +102,8 @@ pub(super) fn save_parameters(
     }
 }
 
-/// Returns the points that the registration `found` used, with their normals and deviations. Outliers and points off
-/// the part are omitted. The estimation of machine parameters uses this form of the points.
+/// Returns the points that the registration `found` used, each with its normal and its deviation in mm. The result is
+/// the input for the estimation of machine parameters. Outliers and points off the part are omitted.
 pub(super) fn surface_points(found: &Registration) -> Vec<SurfacePoint> {
     let contact = |d: &Deviation| SurfacePoint { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
     used_deviations(found).map(contact).collect()

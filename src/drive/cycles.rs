@@ -58,9 +58,12 @@ impl Cycles {
         self.get(number).map_or(0, |cycle| cycle.batch)
     }
 
-    /// Returns two numbers, each summed over all measurements of the run. The first is the number of targets on the
-    /// part that were tried. The second is the number of targets if each measurement had touched every target of the
-    /// task. In a measurement that is not adaptive, only the touched points count as tried.
+    /// Returns two counts, each summed over all measurements of the run:
+    ///
+    /// - The number of targets on the part that the probe tried to touch. In a measurement that is not adaptive, only
+    ///   the touched points are counted.
+    /// - The number of measurements times the number of targets of `task`. It is the number of tries without adaptive
+    ///   measurement.
     pub(super) fn touch_counts(&self, task: &Task) -> [usize; 2] {
         let measured = self.0.values().filter_map(|cycle| cycle.points.as_ref());
         let tried = measured.clone().map(|points| match points.tried_targets.is_empty() {
@@ -70,10 +73,13 @@ impl Cycles {
         [tried.sum(), measured.count() * task.targets.len()]
     }
 
-    /// Returns the last judged cycle before cycle `number` that measured the result of an earlier pass. A cycle counts
-    /// only if it was judged (its measurement was accepted by the gate) and its measurement has updated the learning
-    /// (the estimate of how the part responds to corrections). Returns `None` if there is no such cycle, or if cycle
-    /// `number` does not exist.
+    /// Returns the last cycle before cycle `number` that fulfils three conditions:
+    ///
+    /// - The cycle was judged, so at least one judgement of its result was written.
+    /// - Its measurement has updated the learning state (the estimate of how the part responds to corrections).
+    /// - It measured the result of an earlier pass than cycle `number` did.
+    ///
+    /// Returns `None` if there is no such cycle, or if cycle `number` does not exist.
     pub(super) fn previous_judged(&self, number: u32) -> Option<&CycleState> {
         let pass = self.get(number)?.correction.cycle;
         let earlier = |c: &&CycleState| c.is_judged() && c.learning.is_some() && c.correction.cycle < pass;
@@ -111,9 +117,11 @@ impl Cycles {
     }
 
     /// Returns the priors of the error model for the next parts: one for passes without a correction, and one for
-    /// passes with a correction. Each prior is the earlier prior of this cell, updated with the last judged cycle of
-    /// the same kind. Priors that came from other cells are omitted. Otherwise these cells would later receive their
-    /// own results again.
+    /// passes with a correction. Each prior is the prior that this cell has learned from earlier parts, updated with
+    /// the last judged cycle of the same kind.
+    ///
+    /// A prior that this cell received from another cell is not included. The result is later sent to other cells, and
+    /// they would receive their own results again.
     pub(super) fn part_priors(&self, task: &Task) -> PartPriors {
         let of_this_cell = task.learned.as_ref().filter(|learned| learned.taught_by.is_none());
         let mut taught = of_this_cell.map(|learned| learned.fields).unwrap_or_default();

@@ -445,12 +445,14 @@ impl Drive {
         self.handle_event(event, None).await;
     }
 
-    /// Removes the oldest entry from the queue of entries that wait for their record, and executes its action.
-    /// `recorded` is the result of recording this entry.
+    /// Handles the oldest entry of the queue of entries that wait to be recorded, and removes it from this queue.
+    /// `recorded` is the result of the attempt to record this entry.
     ///
-    /// If the entry was recorded, executes its command (if the cell still requires the command), sends its answer, or
-    /// passes its confirmation to the machine. If the entry was not recorded, does not execute the command, and answers
-    /// with the reason.
+    /// If the entry was recorded, does the action that waited for the record. This action is to execute a command, to
+    /// answer an order, or to pass the confirmation of a person to the driver of a machine. A command is executed only
+    /// if the cell still requires it.
+    ///
+    /// If the entry was not recorded, does not do this action, and reports the reason.
     async fn handle_recorded(&mut self, recorded: Result<(), RecordFailure>) {
         let Some(PendingRecord { action: then, .. }) = self.backlog.pop_front() else { return };
         match recorded {
@@ -492,9 +494,8 @@ impl Drive {
         }
     }
 
-    /// Reports to the cell that `command` was not sent, because it could not be recorded. A START is reported as
-    /// refused. Does nothing for any other command that the cell no longer requires, or to which the cell expects no
-    /// answer.
+    /// Reports to the cell that `command` was not sent, because it could not be recorded. A START is always reported,
+    /// as refused. Any other command is reported only if the cell still requires it and expects an answer to it.
     async fn report_not_recorded(&mut self, command: Command) {
         if !self.cell.still_requires(&command) && !matches!(command, Command::StartMachine { .. }) {
             return;
@@ -685,13 +686,16 @@ impl Drive {
         });
     }
 
-    /// Converts a confirmation of a person (started, done, or at rest) into a confirmation for the driver of a machine.
-    /// Returns the machine, the name of the confirmation for the record, and the confirmation.
+    /// Converts the confirmation of a person (started, done, or at rest) into a confirmation for the driver of a
+    /// machine. Returns the machine, the name of the confirmation for the record, and the confirmation.
     ///
     /// # Errors
-    /// Returns a message for the person. For "started" and "done": no job is in progress, or the digits of the
-    /// correction map are wrong. For "at rest": no machine is named and no job is in progress. For every other request:
-    /// it is not a confirmation.
+    /// Returns a message for the person:
+    ///
+    /// - For "started" and "done": no job is in progress, or the person gave digits that are not the first digits of
+    ///   the SHA-256 of the correction map.
+    /// - For "at rest": the person names no machine, and no job is in progress.
+    /// - For every other request: it is not a confirmation.
     fn operator_confirmation(&self, request: &Request) -> Result<(Device, &'static str, OperatorConfirmation), String> {
         let at_work = self.cell.state().phase().and_then(Phase::moving_device);
         let job = || at_work.ok_or("no machine has a job in progress, so there is no job to confirm");
@@ -784,8 +788,9 @@ impl Drive {
         self.status.send_replace(self.snapshot());
     }
 
-    /// Returns the first implausible figure of a pass record, compared with the pass that was commanded in this cycle;
-    /// `None` if there is none.
+    /// Compares a pass record with the pass that was commanded in the current cycle. Returns a text about the first
+    /// implausible value or the first difference. Returns `None` if there is none. If the current cycle has no pass,
+    /// returns a text that states this.
     fn pass_record_flaw(&self, record: &PassRecord) -> Option<String> {
         let number = self.cell.cycle();
         let Some(cycle) = self.cycles.get(number) else { return Some(format!("cycle {number} has no pass")) };
@@ -1271,7 +1276,9 @@ fn failure_message(failure: &RecordFailure) -> String {
     }
 }
 
-/// Returns a judged figure with its limit as JSON, for the result file of a cycle.
+/// Converts a form figure that was compared with its limit (such as the PV) into JSON for the result file of a cycle.
+/// The JSON contains the name, the value, the expanded uncertainty and the limit in mm, and the probability (0 to 1)
+/// that the figure is within the limit. The limit is null if it is not finite.
 fn judged_figure(of: &ComparedFigure) -> Value {
     json!({
         "name": of.name,

@@ -59,8 +59,9 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
     }
 }
 
-/// Returns the machine to which a command goes, and the kind of request that an [`Event::Refused`] names if the machine
-/// refuses the command. Returns `None` for a command that no machine can refuse.
+/// Returns the machine to which `command` is sent, and the kind of this request. If the machine refuses the request,
+/// [`Event::Refused`] contains the same machine and the same kind, so that the refusal can be assigned to the command.
+/// Returns `None` for a command that no machine can refuse.
 fn machine_request(command: &Command) -> Option<(Device, MachineRequest)> {
     Some(match command {
         Command::LoadPass { .. } => (Device::Grinder, MachineRequest::Load),

@@ -97,10 +97,14 @@ pub(super) fn gate_cycle(
     (Event::Collected { cycle: number, targets: planned.max(found), found, gate }, product)
 }
 
-/// Merges the touches that were repeated (`measurement`) into the earlier points of the same part (`points`). Replaces
-/// each outlier by its repeated touch, and adds the touches around the outliers. Keeps an outlier unchanged if its
-/// repeated touch did not find the part. Keeps the control points (good touches that were repeated as a check)
-/// unchanged. Returns the merged points, and the number of repeated touches that found a surface.
+/// Merges touches that were repeated (`measurement`) into the earlier points of the same part (`points`). `again` is
+/// the plan of the repetition: the outliers, the control points (good touches that were repeated as a check) and the
+/// limit of their change. Returns the merged points, and the number of touches in `measurement` that found a surface.
+///
+/// - An outlier is replaced by its repeated touch. If the repeated touch did not find the part, the outlier stays
+///   unchanged.
+/// - The touches around the outliers are added.
+/// - The control points keep their earlier coordinates.
 ///
 /// # Errors
 /// One of the two sets contains probe centres and the other contact points, the measurement has too few points, or the
@@ -135,12 +139,16 @@ fn merge_repeated_touches(
     Ok((all, found as u32))
 }
 
-/// Checks with the control points that the part has not moved between the first touches (`points`) and the repeated
-/// touches (`repeated`). The change of a control point is the distance of its two touches along the surface normal. The
-/// second largest change is compared with the limit, because one control point may be a wrong touch.
+/// Checks with the control points (good touches that were repeated as a check) that the part has not moved between two
+/// measurements. `points` are the points of the first measurement. `repeated` are the repeated touches of the control
+/// points, in the order of the control points in `again`. `again` contains the control points and the limit of their
+/// change in mm.
+///
+/// The change of a control point is the distance between its two touches along the surface normal. Only the second
+/// largest change is compared with the limit, because one control point may be a wrong touch.
 ///
 /// # Errors
-/// This change exceeds the limit in `again`, or fewer than two control points were touched.
+/// The second largest change exceeds the limit, or fewer than two control points were touched again.
 fn check_control_points(
     again: &RepeatedTouches,
     points: &UsablePoints,
@@ -243,10 +251,12 @@ pub(super) struct TouchRecord {
 }
 
 impl TouchRecord {
-    /// Returns the record of the targets that were tried and found so far (from `so_far`), extended by a new batch of
-    /// an adaptive measurement. `asked` are the indices of the batch's targets in the pattern. `plan` and `measurement`
-    /// are the plan and the result of the batch. If `asked` is empty, the measurement is not adaptive, and nothing is
-    /// added.
+    /// Returns a record that lists the targets that the probe tried to touch in each batch of an adaptive measurement,
+    /// and the target of each point that was found. `so_far` contains the earlier batches, or is `None` for the first
+    /// batch. `asked` are the indices of the targets of the new batch in the list of all targets of the part. `plan`
+    /// and `measurement` are the plan and the result of the new batch.
+    ///
+    /// If `asked` is empty, the measurement is not adaptive, and no batch is added.
     fn with_batch(so_far: Option<&UsablePoints>, asked: &[usize], plan: &Plan, measurement: &Measurement) -> Self {
         let (mut tried, mut of) =
             so_far.map(|points| (points.tried_targets.clone(), points.point_targets.clone())).unwrap_or_default();
@@ -335,10 +345,12 @@ fn result_failure(task: &Task, plan: &Plan, measurement: &Measurement) -> Option
 /// reports coarse steps.
 const MIN_COMPARED_TOUCHES: usize = 8;
 
-/// Returns a failure of the gate if the touched points contain all points of the measurement `earlier`, equal in every
-/// bit. Two real measurements never give such points, so the machine has returned its old result again. Returns `None`
-/// otherwise. Also returns `None` in a rehearsal, without an earlier measurement, or if that measurement has fewer than
-/// [`MIN_COMPARED_TOUCHES`] points.
+/// Returns a failure of the gate (the check whether a measurement can be used) if the machine has returned an old
+/// result again. This is the case if the touched points contain all points of the measurement `earlier`, equal in every
+/// bit. Two real measurements never agree so exactly. `earlier` is an older measurement with the number of its cycle.
+///
+/// Returns `None` if the points differ. Also returns `None` if there is no earlier measurement, if it has fewer than
+/// [`MIN_COMPARED_TOUCHES`] points, or in a rehearsal (a run in which people act as the machines and no part exists).
 fn repeated_result_failure(
     task: &Task,
     earlier: Option<&(u32, Arc<UsablePoints>)>,
@@ -373,13 +385,15 @@ fn temperature_failure(task: &Task, measurement: &Measurement) -> Option<GateFai
     }
 }
 
-/// Measures the radius of the probe by a sphere fit to `points`, the touched points on the reference sphere. Returns
-/// the probe radius, its standard uncertainty, and the RMS of the residuals, all in mm. Returns `None` if the recipe
-/// does not measure a reference sphere.
+/// Measures the radius of the probe. Fits a sphere to `points`, the touched points on the reference sphere, and
+/// subtracts the radius of the reference sphere. Returns the probe radius, its standard uncertainty, and the RMS of the
+/// residuals, all in mm. Returns `None` if the recipe has no reference sphere.
 ///
 /// # Errors
-/// No sphere fits. Or the fitted radius shows a wrong kind of points: contact points instead of probe centres, or
-/// inches instead of millimetres.
+/// - No sphere can be fitted.
+/// - The fitted radius is nearly the radius of the reference sphere. Then the points are contact points instead of
+///   probe centres.
+/// - The fitted radius is about 25.4 times too small. Then the coordinates are in inches instead of mm.
 fn fit_probe_radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 3]>, GateFailure> {
     let Some(sphere) = task.reference_sphere else { return Ok(None) };
     let fit = fit_sphere(points).map_err(|error| GateFailure::Broken(error.to_string()))?;
@@ -552,8 +566,9 @@ fn register_and_evaluate(
     })
 }
 
-/// Returns a message for people for each machine parameter that should be corrected as a parameter. Such a parameter
-/// can be separated from other effects, and its estimated error is larger than its expanded uncertainty.
+/// Returns one message for people for each machine parameter, such as the wheel radius, whose error should be corrected
+/// at its cause. A parameter is included if its effect differs from all other effects in the fit, and if its estimated
+/// error is larger than the expanded uncertainty of this estimate.
 fn offered_messages(told: &compensation::ParameterEstimation) -> impl Iterator<Item = String> {
     told.estimates.iter().filter(|p| p.is_offered).map(|p| p.message.clone())
 }
@@ -668,8 +683,9 @@ fn cell_figures(
     }
 }
 
-/// Returns two numbers of contributions to the uncertainty: those without a stated value, and all. The position of the
-/// datum counts as a contribution only if the recipe locks a direction. Returns `None` if there is no contribution.
+/// Counts the contributions to the uncertainty of the form. Returns two numbers: the contributions without a stated
+/// value, and all contributions. The uncertainty of the datum is counted only if it has a stated value or the recipe
+/// locks a direction of the pose. Returns `None` if there is no contribution.
 fn unstated_contributions(task: &Task, form: &Form) -> Option<[u32; 2]> {
     let counts = |share: &&model::BudgetEntry| {
         share.is_stated || share.source != model::UncertaintySource::Datum || task.locked_direction_sigmas().is_some()
@@ -679,7 +695,8 @@ fn unstated_contributions(task: &Task, form: &Form) -> Option<[u32; 2]> {
     (!all.is_empty()).then_some([some as u32, all.len() as u32])
 }
 
-/// Returns the RMS without an independent contribution: the square root of rms^2 - scatter^2, or 0 if that is negative.
+/// Subtracts the independent contribution `scatter_mm` (a standard deviation) from the root mean square `rms_mm`.
+/// Returns the square root of rms_mm^2 - scatter_mm^2, in mm. Returns 0 if this difference is negative.
 fn subtract_in_quadrature(scatter_mm: f64, rms_mm: f64) -> f64 {
     (rms_mm * rms_mm - scatter_mm * scatter_mm).max(0.0).sqrt()
 }
@@ -693,8 +710,9 @@ const _: () = {
     }
 };
 
-/// Converts the form figures of the error model into those that the cell judges. `scatter_mm` is the standard deviation
-/// of the probe's noise.
+/// Converts the form figures of the error model (intervals of PV, PV 99.8 % and RMS, in mm) into the type that the cell
+/// judges and records. `scatter_mm` is the standard deviation of the probe's noise. It is copied into the result and
+/// changes no figure.
 fn cell_form_figures(of: &model::FormFigures, scatter_mm: f64) -> RecordedFormFigures {
     let interval = |of: model::Interval| {
         let model::Interval { median_mm, low_mm, high_mm, quantiles_mm, .. } = of;
@@ -851,8 +869,9 @@ fn rms(values: &[f64]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / values.len().max(1) as f64).sqrt()
 }
 
-/// Returns a text for each machine parameter whose compensation exceeds its tolerance in the recipe. Each text states
-/// the error, its expanded uncertainty and the compensation, so that a person can decide before the next pass.
+/// Returns one text for each machine parameter for which a person must decide before the next pass. These are the
+/// parameters whose compensation exceeds the limit for this parameter in the recipe. The text states the estimated
+/// error, its expanded uncertainty and the compensation.
 fn parameter_questions(cycle: &CycleState) -> Vec<String> {
     let beyond = cycle.parameters.iter().flat_map(|told| &told.estimates).filter(|p| p.exceeds_tolerance);
     let question = |p: &compensation::EstimatedParameter| {

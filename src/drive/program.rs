@@ -88,16 +88,17 @@ impl Programs {
         nominal_height_field(nominal)
     }
 
-    /// Returns the file name of the program of a pass, with the extension of the dialect.
+    /// Returns the file name of the program of a pass. Its extension is defined by the dialect (the program language of
+    /// the controller).
     pub(super) fn file_name(&self) -> String {
         format!("{PROGRAM_FILE}.{}", self.dialect.dialect.extension)
     }
 
-    /// Checks that the dialect can express a program with these settings: the path tolerance, arcs, and the rotary axis
-    /// if the wheel is tilted.
+    /// Checks that the dialect (the program language of the controller) can express a program with these settings. The
+    /// checked settings are the path tolerance, arcs, and the rotary axis if the wheel is tilted.
     ///
     /// # Errors
-    /// The dialect cannot express a setting, or arcs are required together with a tilted wheel.
+    /// The dialect cannot express a setting, or the settings require arcs together with a tilted wheel.
     pub fn check_dialect(&self) -> Result<(), DialectError> {
         if let Some(rotary) = self.options.tilting_axis() {
             self.dialect.turning(rotary)?;
@@ -232,9 +233,9 @@ impl Programs {
         }
     }
 
-    /// Writes the correction of a pass as a table for controllers that compensate by a table. The table contains the
-    /// offset of axis Z in mm at each node of the correction's grid over x and y. `path` is the path with the
-    /// correction.
+    /// Writes the correction of a pass as a table to `file`, for controllers that compensate their axes by a table. The
+    /// table contains the offset of axis Z in mm at each node of the correction's grid over x and y. `path` is the
+    /// planned path with this correction. `map_identity` is the SHA-256 of the correction map, which the table states.
     ///
     /// # Errors
     /// The wheel is tilted, the offsets cannot be computed, or the file cannot be written.
@@ -288,9 +289,11 @@ impl Programs {
     }
 }
 
-/// Returns the correction from which a path is planned. Without parameter corrections, this is `correction` itself.
-/// With parameter corrections, each map value is the sum of the residual map and the displacement by wheel setting and
-/// tilt. The map does not contain the error of the wheel radius, because [`Programs::path`] plans with the corrected
+/// Returns the correction whose map is used to plan the path of the wheel.
+///
+/// Without corrections of machine parameters, the result is `correction` itself. With such corrections, a displacement
+/// is added to each value of the map. This displacement compensates the wrong position of the wheel and the tilt of the
+/// part. The error of the wheel radius is not added, because [`Programs::path`] plans the path with the corrected
 /// radius.
 fn path_correction(correction: &Correction) -> Cow<'_, Correction> {
     match &correction.set {

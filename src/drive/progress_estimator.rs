@@ -41,8 +41,12 @@ impl ProgressEstimator {
         self.marks.push_back((now, done));
     }
 
-    /// Adapts the estimate to the state of the cell. Deletes the earlier reports if the cell is not in the state
-    /// Execute, because a held job has no speed. Deletes the job too if the cell no longer runs or reconciles it.
+    /// Adapts the estimate of the remaining time to the state of the cell:
+    ///
+    /// - If the cell is not in the state Execute, deletes the earlier progress reports, because a held job has no
+    ///   speed.
+    /// - If the cell neither runs the job nor asks the machine whether it still executes the job (reconciliation), also
+    ///   deletes the job.
     pub(super) fn update_state(&mut self, state: State) {
         let at = state.phase().and_then(|phase| phase.job());
         let is_at_it = |device| matches!(at, Some((at, JobStep::Run | JobStep::Reconcile)) if at == device);

@@ -222,12 +222,13 @@ impl JournalWriter {
         }
     }
 
-    /// Executes `job` (usually the writing of one entry) on the journal, and retries as long as the failure can pass.
-    /// Reports the failure to the loop at the first attempt and at every tenth further one. The report is repeated,
-    /// because an earlier report may have been about an earlier entry.
+    /// Executes `job` (usually to write one entry) on the journal. If `job` fails for a temporary reason, for example a
+    /// full disk, repeats it until it succeeds.
+    ///
+    /// Reports the failure to the loop of the run after the first attempt, and again after every tenth further attempt.
     ///
     /// # Errors
-    /// The failure cannot pass by itself, or the run has ended meanwhile.
+    /// The failure is not temporary, or the run has ended while the attempts were repeated.
     async fn write_with_retry(&mut self, job: &JournalTask) -> Result<(), JournalError> {
         let mut tries = 0_u32;
         loop {
@@ -316,14 +317,19 @@ impl OutputFiles {
         Self { run_folder: run, subfolder: below, final_subfolder: None, file_names: Vec::new() }
     }
 
-    /// Sets `settled` as the subfolder for the final results of an adaptive measurement, on which the cell decides.
-    /// [`OutputFiles::switch_to_final_subfolder`] switches to this subfolder.
+    /// Sets the subfolder for the final results of an adaptive measurement (targets are touched in batches until enough
+    /// is known). `settled` is the path of this subfolder, relative to the run folder. Files still go to the subfolder
+    /// of the current batch until [`OutputFiles::switch_to_final_subfolder`] is called.
     pub(super) fn with_final_subfolder(self, settled: String) -> Self {
         Self { final_subfolder: Some(settled), ..self }
     }
 
-    /// Switches to the subfolder that [`OutputFiles::with_final_subfolder`] has set, and creates it. Does nothing if
-    /// none was set.
+    /// Creates the subfolder for the final results of an adaptive measurement. All files that are added later go to
+    /// this subfolder. [`OutputFiles::with_final_subfolder`] has set its path. Does nothing if no such subfolder was
+    /// set, or if this method was already called.
+    ///
+    /// # Errors
+    /// The subfolder cannot be created.
     pub(super) fn switch_to_final_subfolder(&mut self) -> Result<(), FormatError> {
         let Some(settled) = self.final_subfolder.take() else { return Ok(()) };
         self.subfolder = settled;

@@ -140,9 +140,11 @@ pub async fn execute_step<M: Machine>(
     ended
 }
 
-/// Makes this program the owner of the machine. If the machine belongs to another client, retries for up to
-/// [`OWNER_RELEASE_TIME`]. The other client may have ended a moment ago, and the machine then releases it within this
-/// time.
+/// Makes this program the owner of the machine. If the machine still belongs to another client, tries again for up to
+/// [`OWNER_RELEASE_TIME`]. If the other client has ended, the machine releases it within this time.
+///
+/// # Errors
+/// The machine still belongs to another client after this time, or the request fails.
 async fn claim_with_retry<M: Machine>(machine: &mut M) -> Result<(), DeviceError> {
     let by = Instant::now() + OWNER_RELEASE_TIME;
     loop {

@@ -316,7 +316,10 @@ impl<'t> Replay<'t> {
         Ok(())
     }
 
-    /// Returns the usable points of the measurement of cycle `number`, from its recorded files.
+    /// Reads the recorded files of the measurement of cycle `number`, and returns its usable points.
+    ///
+    /// # Errors
+    /// A file cannot be read, or the points do not pass the checks of a measurement.
     fn read_points(&self, number: u32) -> Result<super::task::UsablePoints, ReplayError> {
         let read = |name: &str| match self.files.get(&(number, name.to_owned())) {
             Some(file) => {

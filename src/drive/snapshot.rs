@@ -6,7 +6,8 @@ use super::Drive;
 use crate::cell::{Cell, Phase, State};
 
 impl Drive {
-    /// Returns the snapshot of the cell for the control socket.
+    /// Returns the present status of the run for the clients of the control socket: for example the state of the cell,
+    /// the progress of the job, the alarms, and the next action of a person.
     pub(super) fn snapshot(&self) -> Snapshot {
         let state = self.cell.state();
         let waits_for: Vec<String> = match state.phase().and_then(Phase::job) {
@@ -40,7 +41,8 @@ impl Drive {
 }
 
 /// Returns the next action that the cell needs from a person. `waits_for` are the texts in which the machine of the
-/// current job states why it waits. The first text is returned if nothing more urgent is to be done.
+/// current job states what it waits for. If no other action is needed, the action is the first of these texts. If there
+/// is also no such text, no action is needed.
 fn next_step(cell: &Cell, waits_for: &[String]) -> NextStep {
     if let (State::Execute(_), Some(device)) = (cell.state(), cell.clear_confirmation_device()) {
         return NextStep::SeeClear { device };

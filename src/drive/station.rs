@@ -852,7 +852,9 @@ impl<B: StationDriver> MachineTask<B> {
         self.observed.next_attempt = Some(Instant::now() + pause.min(MAX_RETRY_INTERVAL));
     }
 
-    /// Compares the status with the one before, and reports each change as an event.
+    /// Compares `status` with the previous status of the machine, and reports each change to the cell as an event.
+    /// Examples are another operating mode, a signal out of its range, a held or resumed job, progress, the end of a
+    /// job, and a fault.
     async fn report_changes(&mut self, status: &Status) {
         let before = self.observed.state.replace(status.state);
         self.report_mode(status).await;
@@ -1034,9 +1036,11 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports the end of a finished job to the cell. For a pass, first reads the pass record. If the link is lost
-    /// while it is read, reports no end, and the next poll tries again. Does nothing if no job was running, or if its
-    /// end was already reported and no stop is in progress.
+    /// Reports to the cell that a job has ended. For a pass, first reads the pass record from the grinder. If the link
+    /// is lost during this reading, does not report the end, and the next poll tries again.
+    ///
+    /// Does nothing if no job was running and no stop is in progress. Also does nothing if the end of the job was
+    /// already reported and no stop is in progress.
     async fn finish_job(&mut self, status: &Status) {
         if self.observed.end_reported && !self.observed.stopping {
             return;

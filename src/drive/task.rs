@@ -135,11 +135,12 @@ impl AdaptiveOptions {
     /// Ratio of an rms limit to a PV limit that is equally hard to meet.
     const RMS_TO_PV_RATIO: f64 = 0.2;
 
-    /// Returns the accepted probability that one evaluation of an adaptive measurement decides wrongly (0 to 1). This
-    /// probability is `accepted_risk` divided by the maximum number of evaluations.
+    /// Returns the accepted probability, from 0 to 1, that one evaluation of an adaptive measurement accepts a part
+    /// that is out of tolerance. This probability is `accepted_risk` divided by the maximum number of evaluations (5).
     ///
-    /// The result is limited to 1 minus the probability that the tolerance requires. A part that an evaluation accepts
-    /// is therefore also accepted by the final judgement.
+    /// The result is at most 1 minus `tolerance.probability`, the probability with which the final judgement must find
+    /// the part in tolerance. With this limit, a part that an evaluation accepts is also accepted by the final
+    /// judgement.
     pub fn decision_risk(&self) -> f64 {
         (self.accepted_risk / Self::MAX_DECISIONS).min(1.0 - self.tolerance.probability)
     }
@@ -352,8 +353,9 @@ impl Task {
     /// other cells. The first pass is then ground with the correction in `learned`.
     ///
     /// # Errors
-    /// Returns an error if this correction exceeds the maximum correction at a node, or the removal budget of this run.
-    /// The task is then unchanged.
+    /// Returns an error if this correction exceeds the maximum correction at a node. Also returns an error if the first
+    /// pass with this correction would remove more material than the removal budget of this run (a depth in mm). The
+    /// task is unchanged after an error.
     pub fn start_from_learned(&mut self, learned: Learned) -> Result<(), NextPassError> {
         let before = self.learned.replace(learned);
         let within = self.first_correction().removed_mm(&self.correction_limits).map_err(|error| match error {
@@ -368,22 +370,26 @@ impl Task {
         within.map(|_| ())
     }
 
-    /// Combines the learned states in `others` into one initial state for this task. Each entry of `others` names a run
-    /// of another cell and holds the state that this run learned. `alike` is the similarity of the machines: the more
-    /// similar the machines are, the more is taken over.
+    /// Combines the learned states of other machines into one initial state for this task. Each entry of `others` names
+    /// a run of another cell and holds the learned state of that run. `alike` is the similarity of the machines. The
+    /// more similar the machines are, the more of their learned error is used.
     ///
-    /// Returns `None` if no state in `others` contains a learned error in the same bands of wavelengths as this task.
+    /// The learning treats the error of the surface separately in several bands of wavelengths. Returns `None` if no
+    /// state in `others` contains a learned error in the same bands as this task.
     pub fn learned_from_others(&self, others: &[(CellRun, Learned)], alike: &MachineSimilarity) -> Option<Learned> {
         let of_this = (self.simulation, self.setting.clone());
         Learned::from_others(others, alike, of_this, (&self.new_learning(), self.zero_correction()))
     }
 
-    /// Writes the files of the first pass into `folder`: the correction, and the program if one can be planned. This is
-    /// meant for a run that begins with a learned state. Creates `folder` if it does not exist. Returns the names of
-    /// the written files.
+    /// Writes the files of the first pass into `folder`: the correction, the program and the axis table. The program
+    /// and the table are omitted if they cannot be computed. Creates `folder` if it does not exist. Returns the names
+    /// of the written files.
+    ///
+    /// The function is meant for a run that begins with a learned state.
     ///
     /// # Errors
-    /// Those of [`Task::first_path`], and files that cannot be written.
+    /// Those of [`Task::first_path`]; a file that cannot be written; a program that is too long, if the cell file names
+    /// a program folder of the controller.
     pub fn save_first_pass(&self, folder: &Path) -> Result<Vec<String>, ProgramError> {
         ResultFolder::prepare(folder).map_err(GcodeError::from)?.keep();
         let (first, none) = (self.first_correction(), self.zero_correction());
@@ -414,10 +420,10 @@ impl Task {
         RESERVE_BYTES + POINT_BYTES * points + NODE_BYTES * nodes
     }
 
-    /// Computes the path of the first pass, and its summary.
+    /// Computes the path of the wheel for the first pass. Returns the path with its summary.
     ///
-    /// Returns `None` if the path planning of this program fails for the part. The controller of the grinder may still
-    /// be able to plan a path from the correction map. The field `programs` then contains the reason.
+    /// Returns `None` if Regrind cannot plan a path for this part. The field `programs` of the task then contains the
+    /// reason. The controller of the grinder may still be able to plan a path from the correction map.
     ///
     /// # Errors
     /// A surface that the wheel cannot grind; a path that exceeds the limits of the grinder.
@@ -435,8 +441,9 @@ impl Task {
         self.scallops.map_or(0.0, |scallops| scallops.rms_mm)
     }
 
-    /// Returns the state of the learning before the first pass. If the run begins with a learned state, the result is
-    /// derived from that state for the next part. Otherwise the result is a state without any learned error.
+    /// Returns the state of the learning before the first pass. If the run begins with a learned state, the result
+    /// contains the learned error of that state with an increased uncertainty, because the part is a new one. Otherwise
+    /// the result is a state without any learned error.
     pub(super) fn initial_learning(&self) -> LearningState {
         self.learned.as_ref().map_or_else(|| self.new_learning(), |learned| learned.known.for_next_part())
     }
@@ -447,14 +454,16 @@ impl Task {
         LearningState::new(self.gain_rule, &self.map_options, size_mm, self.repeatability_mm)
     }
 
-    /// Registers the measured `points` (CMM frame) to the nominal surface. `probe_radius_mm` is the distance of the
-    /// points from this surface, such as the radius of the probe ball. It is 0 for contact points. Returns the
-    /// registration, and the options with which it was computed.
+    /// Registers the measured `points` (CMM frame) to the nominal surface. Returns the registration, and the options
+    /// with which it was computed. `probe_radius_mm` is the distance of the points from the surface, such as the radius
+    /// of the probe ball. It is 0 for contact points.
     ///
-    /// The field `start_at_fixture` of the task selects the start: the fixture pose, or a search over poses. The
-    /// surface may not determine one direction of a pose that the search finds, for example the rotation about the axis
-    /// of symmetry. The position in this direction would then be arbitrary, and the correction would be ground at the
-    /// wrong place. In this case the registration is repeated from the fixture pose.
+    /// The field `start_at_fixture` of the task selects the start. If it is true, the registration starts at the
+    /// fixture pose. Otherwise it starts with a search over poses.
+    ///
+    /// A search can end in a pose with a direction that the surface does not determine, for example the rotation about
+    /// an axis of symmetry. The position in this direction is then arbitrary, and the correction would be ground at the
+    /// wrong place. In this case the registration is repeated with a start at the fixture pose.
     ///
     /// # Errors
     /// Those of [`register`].
@@ -466,9 +475,13 @@ impl Task {
         self.register_with_start(points, probe_radius_mm, self.start_at_fixture)
     }
 
-    /// Registers the measured `points` to the nominal surface, as [`Self::register`] does, but the caller selects the
-    /// start. If `start_at_fixture` is true, the registration starts at the fixture pose. Otherwise it starts with a
-    /// search over poses. `probe_radius_mm` is the distance of the points from the surface, and 0 for contact points.
+    /// Registers the measured `points` (CMM frame) to the nominal surface, with a start that the caller selects.
+    /// Returns the registration, and the options with which it was computed. `probe_radius_mm` is the distance of the
+    /// points from the surface. It is 0 for contact points.
+    ///
+    /// If `start_at_fixture` is true, the registration starts at the fixture pose. Otherwise it starts with a search
+    /// over poses. If the search ends in a pose with a direction that the surface does not determine, the registration
+    /// is repeated with a start at the fixture pose.
     ///
     /// # Errors
     /// Those of [`register`].
@@ -491,9 +504,9 @@ impl Task {
         Ok((register(&self.nominal, points, &options)?, options))
     }
 
-    /// Returns the standard uncertainties with which the fixture locks the pose of the part. The order is x, y, z in
-    /// mm, then rx, ry, rz in rad. The value is 0 for a direction that is not locked, and for a locked direction whose
-    /// uncertainty the recipe does not state.
+    /// Returns the standard uncertainty of the fixture in each direction of the part's pose that the fixture locks. The
+    /// order is x, y, z in mm, then rx, ry, rz in rad. The value is 0 for a direction that is not locked. The value is
+    /// also 0 for a locked direction if the recipe states no uncertainty.
     ///
     /// Returns `None` if no direction is locked.
     pub fn locked_direction_sigmas(&self) -> Option<[f64; 6]> {
@@ -504,7 +517,8 @@ impl Task {
     }
 
     /// Returns the options for the estimation of machine parameters (such as the wheel radius) from a measurement.
-    /// `told` holds the parameter corrections with which the measured pass was ground; `None` if there were none.
+    /// `told` holds the corrections of these parameters with which the measured pass was ground. `told` is `None` if
+    /// the pass had no such corrections.
     pub fn parameter_options(&self, told: Option<&ParameterCorrections>) -> ParameterOptions {
         ParameterOptions {
             free_motions: self.registration_options.locked.map(|locked| !locked),
@@ -525,13 +539,15 @@ impl Task {
         self.pass.wheel_radius_mm + told.map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
 
-    /// Returns the SHA-256 that identifies the correction map which the grinder receives for `correction`.
+    /// Returns the SHA-256 that identifies a correction map. This map is the one that the grinder receives for a pass
+    /// with `correction`.
     pub fn map_identity(&self, correction: &Correction) -> [u8; 32] {
         self.payloads(correction).0.identity()
     }
 
-    /// Returns the two messages that the grinder receives for a pass with `correction`: the correction map, and the
-    /// parameters of the pass (such as the level and the corrected wheel radius).
+    /// Returns the two messages that the grinder receives for a pass with `correction`. The first message is the
+    /// correction map. The second message contains the parameters of the pass, such as the corrected wheel radius and
+    /// the level (the height of the target surface above the nominal surface).
     pub(super) fn payloads(&self, correction: &Correction) -> (CorrectionMap, Pass) {
         let map = CorrectionMap {
             grid: correction.grid,
@@ -544,12 +560,12 @@ impl Task {
     }
 
     /// Creates the complete measuring plan in the CMM frame: first the reference sphere, if the task has one, then all
-    /// targets on the part. `cmm_from_model` is the last measured pose. `level_mm` is the height, in mm, of the ground
-    /// surface above the nominal surface.
+    /// targets on the part. `cmm_from_model` is the last measured pose of the part; it transforms the model frame to
+    /// the CMM frame. `level_mm` is the height, in mm, of the ground surface above the nominal surface.
     ///
     /// If `seated_anew` is true, the part may have been clamped again. The plan then begins with a few targets on the
-    /// part that are far apart from each other. They are touched at low speed, to detect a displaced part. The
-    /// reference sphere and the other targets follow.
+    /// part that are far apart from each other. These targets are touched at low speed, to detect a displaced part. The
+    /// reference sphere and the remaining targets follow.
     pub fn plan(&self, level_mm: f64, cmm_from_model: &Pose, seated_anew: bool) -> Plan {
         let first = if seated_anew { farthest_points(&self.target_places(), CAREFUL_TARGETS) } else { Vec::new() };
         let rest = (0..self.targets.len()).filter(|k| !first.contains(k)).collect();
@@ -614,8 +630,12 @@ impl Task {
         Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful_start: careful }
     }
 
-    /// Writes `correction`, the correction of a pass, to the file `correction.csv` in `files`. The file also states the
-    /// SHA-256 of the map of `base`. `base` is the earlier correction that `correction` replaces.
+    /// Writes `correction`, the correction of a pass, to the file `correction.csv` in `files`. `base` is the earlier
+    /// correction that `correction` replaces. Comments in the file state the SHA-256 of the correction map that each of
+    /// these two corrections gives.
+    ///
+    /// # Errors
+    /// Those of `write_correction`, such as a file that cannot be written.
     pub(super) fn save_correction(
         &self,
         files: &mut OutputFiles,
@@ -628,15 +648,21 @@ impl Task {
         write_correction(&files.add_file("correction.csv"), correction, (&identities, &set), self.simulation)
     }
 
-    /// Writes the program and the axis table for the pass with `correction` into `files`.
+    /// Writes the program and the axis table for the pass with `correction` into `files`. The axis table contains the
+    /// offset of axis Z at each node of the correction.
     ///
-    /// Returns `None` if both files were written. Otherwise returns the reason why a file was omitted: this program
-    /// cannot plan the path, the program is too long, or the table cannot be computed. The grinder can then still grind
-    /// from the correction map.
+    /// Returns `None` if both files were written. Otherwise returns the reason why a file was omitted:
+    ///
+    /// - Regrind cannot plan the path. Both files are omitted.
+    /// - The program is too long, and the cell file names no program folder of the controller. Both files are omitted.
+    /// - The table cannot be computed. Only the table is omitted.
+    ///
+    /// The grinder can then still grind from the correction map.
     ///
     /// # Errors
     /// A surface that the wheel cannot grind; a path that exceeds the limits of the grinder; a file that cannot be
-    /// written; a program that is too long for a controller with a program folder.
+    /// written; a copy in the program folder that differs from the program; a program that is too long, if the cell
+    /// file names a program folder.
     pub(super) fn save_program(
         &self,
         files: &mut OutputFiles,
@@ -651,8 +677,10 @@ impl Task {
 }
 
 /// Returns the grid of nodes for the corrections of a part. `x_mm` and `y_mm` are the minimum and the maximum of x and
-/// of y on the part. The distance of the nodes is at most `spacing_mm`. If no such grid is possible, the grid has only
-/// the four corners of the part as nodes.
+/// of y on the part. The distance of neighbouring nodes is at most `spacing_mm`.
+///
+/// If this grid would have too many nodes, or if `spacing_mm` is not a finite number above 0, the result has only four
+/// nodes: the corners of the rectangle from `x_mm` and `y_mm`.
 pub(crate) fn correction_grid([x_mm, y_mm]: [[f64; 2]; 2], spacing_mm: f64) -> Grid {
     let corners = [[x_mm[0], y_mm[0]], [x_mm[1], y_mm[1]]];
     Grid::over(corners.into_iter(), spacing_mm).unwrap_or(Grid {

@@ -118,9 +118,9 @@ impl fmt::Display for Columns {
 }
 
 impl Columns {
-    /// Returns true if the header contains all columns that these settings give by name. `names` are the names in the
-    /// header, in lower case. Each of these columns must occur in `names` exactly once. Columns given by number are not
-    /// checked.
+    /// Returns true if the header contains all columns that `self` gives by name. `self` gives the name or the number
+    /// of each of the columns x, y and z. `names` are the names in the header, in lower case. Each name in `self` must
+    /// occur in `names` exactly once. Columns given by number are not checked.
     pub(super) fn are_in(&self, names: &[String]) -> bool {
         self.0.iter().all(|column| match column {
             Column::Named(_) => column.among(names).len() == 1,
@@ -424,7 +424,8 @@ impl Axes {
     }
 
     /// Returns true if the header names x, y and z for at least one group of points: measured, nominal, or not stated.
-    /// A group with an unknown word also counts, if this word occurs in the names of all three axes.
+    /// A group with an unknown word also counts if all three axes have this word, such as `x probe`, `y probe` and `z
+    /// probe`.
     pub(super) fn are_named(&self) -> bool {
         self.unknown.is_some() || self.groups.iter().any(|group| group.iter().all(|columns| !columns.is_empty()))
     }
@@ -514,12 +515,12 @@ pub(super) fn is_unit(word: &str) -> bool {
     is_millimetre(word) || OTHER_UNITS.contains(&word)
 }
 
-/// Returns the unit that `text`, a title or a comment, states: "units: inch", "units/inch" or "all dimensions in
-/// inches". `text` must be in lower case. Returns `None` if `text` states no unit.
+/// Returns the unit that `text`, a title or a comment, states, as in "units: inch", "units/inch" or "all dimensions in
+/// inches". `text` must be in lower case. Returns `None` if no unit is found.
 ///
-/// A statement with the word "unit" has priority. Without such a statement, the first word that names a unit is used.
-/// This word must have at least four letters, because a shorter word can have another meaning. A word for millimetres
-/// is ignored here.
+/// The unit after the word "unit" or "units" is searched first. If there is none, the result is the first word of
+/// `text` that names a unit other than millimetres and has at least four letters. A shorter word can have another
+/// meaning.
 fn stated_unit(text: &str) -> Option<String> {
     const SHORTEST: usize = 4;
     unit_statement(text).or_else(|| {
@@ -607,10 +608,12 @@ fn height_unit(text: &str) -> Option<Range<usize>> {
     heights.filter(|&k| !(k.saturating_sub(2)..k).any(|before| is_other(word(before)))).find_map(unit_behind)
 }
 
-/// Returns the unit that follows the word "unit" or "units" in `text`. `text` must be in lower case. After a colon, `=`
-/// or `/`, any text is returned, even if it is no known unit, because it is clearly meant as one.
+/// Returns the unit that follows the word "unit" or "units" in `text`. `text` must be in lower case.
 ///
-/// Returns `None` if no unit follows.
+/// After a colon, `=` or `/`, the word is clearly meant as a unit. There, an unknown word is returned too. After a
+/// blank or an opening bracket, only a known unit at the end of `text` is returned.
+///
+/// Returns `None` if no such unit follows.
 fn unit_statement(text: &str) -> Option<String> {
     let behind = text.match_indices("unit").map(|(at, word)| &text[at + word.len()..]);
     behind

@@ -162,9 +162,12 @@ impl Reading {
         Ok(())
     }
 
-    /// Reads a statement that the measuring program wrote into the file with `TEXT/`, and stores its value. `after` is
-    /// the text after `TEXT/`, such as `OUTFIL,'plan: 5f3c...'`. The text in quotes has the form `key: value`. A text
-    /// without quotes or without a colon is ignored.
+    /// Reads the property in `after`, and stores its value in `self`. `after` is the text that follows `TEXT/` in a
+    /// DMIS statement, such as `OUTFIL,'plan: 5f3c...'`. The measuring program writes the properties of the measurement
+    /// in this way. The text in quotes has the form `key: value`. A text without quotes, without a colon or with an
+    /// unknown key is ignored.
+    ///
+    /// `statement` is the complete statement. It and `path` only give the position of an error.
     ///
     /// # Errors
     /// An impossible value; a kind of coordinates (centres or contacts) that contradicts an earlier statement.

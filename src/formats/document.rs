@@ -204,8 +204,9 @@ fn left_out((index, deviation): (usize, &Deviation)) -> Option<LeftOut> {
     Some(LeftOut { index, deviation_mm: deviation.deviation_mm, reason })
 }
 
-/// Writes `deviations.csv`, `deviation_uncertainty.csv` and `registration.json` into a folder. The JSON file is written
-/// last: if it exists, the others are complete.
+/// Writes three files into `folder`. `deviations.csv` receives the `deviations` of the points,
+/// `deviation_uncertainty.csv` receives their uncertainties in mm, and `registration.json` receives `document`. The
+/// JSON file is written last. If it exists, the two CSV files are complete.
 ///
 /// # Errors
 /// A file that cannot be written; a deviation that is not finite.

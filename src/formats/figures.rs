@@ -71,11 +71,12 @@ struct TermDocument {
 pub type CycleFigures<'a> =
     (Result<&'a DeviationFigures, &'a FormError>, Option<Result<&'a Slope, &'a FormError>>, Option<&'a Form>);
 
-/// Writes all figures of a cycle to the JSON file `path` (`figures.json`): the figures of the measured points, the
-/// slopes of the error map, and the figures of the form. For each missing figure, the file states the reason.
+/// Writes all figures of a cycle (values such as PV and RMS) to the JSON file `path` (`figures.json`). `figures` holds
+/// the figures of the measured points, `slope` the slopes of the error map, and `form` the form with its figures. If
+/// one of them does not exist, the file states the reason.
 ///
 /// `taken_out` names the terms, such as piston and tilt, that were removed before the figures were computed. The file
-/// repeats these names for each figure. If `simulation` is true, the file is marked as simulated.
+/// repeats these names for the figures. If `simulation` is true, the file is marked as simulated.
 ///
 /// # Errors
 /// A file that cannot be written.

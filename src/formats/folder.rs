@@ -68,11 +68,12 @@ pub fn remove_socket(path: &Path) -> std::io::Result<()> {
     fs::remove_file(path)
 }
 
-/// Creates the symbolic link `link` to `device`. Replaces a link that an earlier simulation left there.
+/// Creates a symbolic link at the path `link` that points to `device`. If a link already exists at this path, for
+/// example from an earlier simulation, it is replaced.
 ///
 /// # Errors
-/// Something at `link` that is not a link, which stays unchanged; a folder that is not writable; a system without such
-/// links (Windows).
+/// A file or folder at `link` that is not a link, which stays unchanged; a folder that is not writable; a system
+/// without symbolic links (Windows).
 pub fn place_link(device: &Path, link: &Path) -> std::io::Result<()> {
     if fs::symlink_metadata(link).is_ok() {
         remove_link(link)?;

@@ -103,9 +103,13 @@ fn values(of: Interval) -> [f64; 3] {
     [of.median_mm, of.low_mm, of.high_mm]
 }
 
-/// Returns the indication of ISO 10110-5, as on a drawing, that the form meets: `3/A(B/C) RMSt<D; RMSi<E; RMSa<F;
-/// lambda=G`. Each of the values A to F is the upper limit of the credible interval of this figure, in nanometres. The
-/// form meets each single value with a probability of 97.5 %. G is `wavelength_nm`.
+/// Returns the upper limits of the form error in the notation of ISO 10110-5 for drawings: `3/A(B/C) RMSt<D; RMSi<E;
+/// RMSa<F; lambda=G`. `of` holds the figures of the form, each with its credible interval.
+///
+/// A is the limit of the power (the spherical part of the error), B of the irregularity and C of the rotationally
+/// symmetric irregularity. D, E and F are the limits of the three RMS figures. Each of the values A to F is the upper
+/// limit of the credible interval of its figure, in nanometres. The true figure is below this limit with a probability
+/// of 97.5 %. G is `wavelength_nm`.
 pub(super) fn notation(of: &IsoFigures, wavelength_nm: f64) -> String {
     let most = |of: Interval| 1e6 * of.high_mm;
     iso_10110_notation(

@@ -88,26 +88,31 @@ pub enum LearnedError {
 }
 
 impl Learned {
-    /// Creates the knowledge of a finished run, which the next part of the same kind begins with. `run` is the name of
-    /// the run. `correction` is the correction that a further pass of this run would have. `known` is the state of the
-    /// learning: the estimated error common to all passes, with its uncertainty. `setting` is the text of the settings
-    /// that two runs must share so that one can learn from the other. `simulation` is true if the passes were
-    /// simulated.
+    /// Creates the knowledge of a finished run: the learned correction and the state of the learning. The next part of
+    /// the same kind begins with this knowledge.
+    ///
+    /// `run` is the name of the run. `correction` is the correction that the run would use for one more pass. `known`
+    /// is the state of the learning: the estimated error common to all passes, with its uncertainty. `setting` is a
+    /// text of settings; another run can use this knowledge only if its own text is equal. `simulation` is true if the
+    /// passes were simulated.
     pub fn new(simulation: bool, setting: String, run: String, correction: Correction, known: LearningState) -> Self {
         let (fields, kind, taught_by) = (PartPriors::default(), None, None);
         Self { layout: LAYOUT, simulation, setting, run, correction, known, fields, kind, taught_by }
     }
 
-    /// Returns the knowledge (the learned correction and the state of the learning) for the first part of a recipe on a
-    /// machine that has not ground this recipe yet. It is predicted from `others`: runs on other machines, each with
-    /// its knowledge. `alike` is the similarity of the machines. `simulation` and `setting` are stored in the result,
-    /// as in [`Self::new`]. `fresh` is the state of the learning before the first pass. `none` is a correction of 0 for
-    /// the new part.
+    /// Predicts the knowledge (the learned correction and the state of the learning) for the first part of a recipe on
+    /// a machine that has not ground this recipe yet. `others` holds runs on other machines, each with its knowledge.
+    /// `alike` is the similarity of the machines. `fresh` is the state of the learning of this machine before the first
+    /// pass. `none` is the correction of 0 for the new part.
     ///
-    /// Returns `None` if no run in `others` has learned an error in the same bands of wavelengths as `fresh`.
+    /// `simulation` and `setting` are stored in the result. `simulation` is true if the passes of this machine are
+    /// simulated. `setting` is the text of settings that must be equal in a run that uses the result.
     ///
-    /// The parameter corrections of another machine (such as that of its wheel radius) do not apply to this machine.
-    /// Therefore the result has no parameter corrections, and its map compensates the predicted error alone.
+    /// The learning treats the error of the surface separately in several bands of wavelengths. Returns `None` if no
+    /// run in `others` has learned an error in the same bands as `fresh`.
+    ///
+    /// The parameter corrections of another machine (such as the correction of its wheel radius) do not apply to this
+    /// machine. Therefore the result contains none, and its correction map compensates the complete predicted error.
     pub fn from_others(
         others: &[(CellRun, Self)],
         alike: &MachineSimilarity,
@@ -125,23 +130,26 @@ impl Learned {
         Some(Self { taught_by, ..learned.with_fields(PartPriors::pooled(&fields)) })
     }
 
-    /// Returns this knowledge of a run with its kind set to `kind`: the text of the settings, without those of the
-    /// cell, that runs of two cells must share. Another cell can begin with this knowledge only if its own text is
-    /// equal.
+    /// Returns this knowledge of a run with `kind` stored in it. `kind` is a text of those settings of the run that do
+    /// not belong to the cell. A run of another cell can begin with this knowledge only if its own text is equal.
     #[must_use]
     pub fn with_kind(self, kind: String) -> Self {
         Self { kind: Some(kind), ..self }
     }
 
-    /// Returns this knowledge of a run with its prior distributions of the error fields replaced by `fields`.
+    /// Returns this knowledge of a run with its statistics of the error model replaced by `fields`. These statistics
+    /// summarise the hyperparameters (such as the range of the covariance function) that were estimated for earlier
+    /// parts. The next part uses them as prior distributions.
     #[must_use]
     pub fn with_fields(self, fields: PartPriors) -> Self {
         Self { fields, ..self }
     }
 
     /// Reads the knowledge that a finished run saved in its folder `run`. Returns the knowledge (the learned correction
-    /// and the state of the learning) and the bytes of its file. `setting` is the text of the settings that both runs
-    /// must share. `simulation` is true if the passes of the new run are simulated.
+    /// and the state of the learning) and the bytes of its file.
+    ///
+    /// `setting` is the text of the settings of the new run. `simulation` is true if the passes of the new run are
+    /// simulated. Each must be equal to the value in the file.
     ///
     /// Returns `None` if the file does not exist, has another version of the layout, or has another `setting` or
     /// another value of `simulation`.
@@ -170,14 +178,16 @@ impl Learned {
     }
 
     /// Parses the knowledge of a run of another cell (the learned correction and the state of the learning) from
-    /// `text`, the content of its file. `kind` is the text of the settings, without those of the cell, that both runs
-    /// must share. `simulation` is true if the passes of this cell are simulated. `from` only names the file in
-    /// messages.
+    /// `text`, the content of its file. `from` only names the file in messages.
+    ///
+    /// `kind` is a text of the settings of the new run, without the settings that belong to its cell. `simulation` is
+    /// true if the passes of this cell are simulated. Each must be equal to the value in `text`.
     ///
     /// # Errors
-    /// A text that Regrind did not write; knowledge of another `kind`, of another value of `simulation`, or of another
-    /// version of the layout; knowledge that its cell took from other cells; an impossible number; a state of the
-    /// learning that cannot be transferred.
+    /// - Regrind did not write `text`, or `text` contains an impossible number.
+    /// - The knowledge has another `kind`, another value of `simulation` or another version of the layout.
+    /// - The other cell did not learn the knowledge in its own run, but took it from other cells.
+    /// - The state of the learning cannot be transferred to another machine.
     pub fn read_other(from: &Path, text: &[u8], kind: &str, simulation: bool) -> Result<Self, LearnedError> {
         let learned = Self::from_saved(from, text)?;
         let is_meant = learned.layout == LAYOUT
@@ -232,10 +242,11 @@ impl Learned {
         (!self.known.is_valid()).then(|| "a number of its knowledge of the grinder is impossible".into())
     }
 
-    /// Returns the correction for the first pass of the next part: the learned correction, interpolated to the grid of
-    /// `none`. It compensates the error that repeated in every pass of the last part. `none` is the correction of 0 for
-    /// the new part. It also gives the number of the pass and the height of the target surface above the nominal
-    /// surface.
+    /// Returns the correction for the first pass of the next part. The learned correction is interpolated to the grid
+    /// of `none`. It compensates the error that repeated in every pass of the last part.
+    ///
+    /// `none` is the correction of 0 for the new part. The result has the grid, the number of the pass and the level
+    /// (the height of the target surface above the nominal surface) of `none`.
     pub fn first_correction(&self, none: Correction) -> Correction {
         let on_grid = |values: &Vec<f64>| self.correction.grid.resample(values, &none.grid);
         let set = self.correction.set.as_ref().map(|set| ParameterCorrections {

@@ -142,10 +142,10 @@ pub struct CorrectionIdentities {
 /// Writes `correction` to `path` (`correction.csv`), as the map that is sent to the grinder. The columns are
 /// `x_mm,y_mm,correction_mm`, in the model frame. A positive correction leaves material.
 ///
-/// Comments above the columns give the number of the pass, the height of the target surface above the nominal surface,
-/// and `identities`: the SHA-256 of the part, of this map and of the previous map. One further comment is written for
-/// each text in `parameters`, which describes a machine parameter that is compensated too. `SIMULATION` is added if
-/// `simulation` is true.
+/// Comments above the columns give the number of the pass and the height of the target surface above the nominal
+/// surface. They also give `identities`: the SHA-256 of the part, of this map and of the previous map. Each text in
+/// `parameters` is written as one further comment. Such a text describes a machine parameter (such as the wheel radius)
+/// that is corrected in addition to the map. The comment `SIMULATION` is written if `simulation` is true.
 ///
 /// # Errors
 /// The same as for [`super::write_deviations`].

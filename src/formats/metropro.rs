@@ -30,13 +30,14 @@ pub(super) const FORMAT: MapFormat = MapFormat {
 /// Reads a MetroPro map of at most 1 GiB. Returns the heights on a grid, in millimetres.
 ///
 /// # Errors
-/// A file that is not readable, not MetroPro, cut, without phases or without lateral scale; invalid numbers in its
-/// header.
+/// A file that is not readable, not MetroPro or cut; a file without phases (the measured heights of the interferometer)
+/// or without the lateral scale (the distance of the samples); invalid numbers in its header.
 pub fn read_metropro(path: impl AsRef<Path>) -> Result<HeightMap, FormatError> {
     open(path.as_ref())?.parse(path.as_ref(), parse_metropro)
 }
 
-/// Parses the bytes of a MetroPro file; `path` only names the file in messages.
+/// Parses `bytes`, the content of a MetroPro file. Returns the heights on a grid, in millimetres. `path` only names the
+/// file in messages.
 ///
 /// # Errors
 /// The same as for [`read_metropro`].

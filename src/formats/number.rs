@@ -142,8 +142,13 @@ fn plain(field: &[u8]) -> Result<f64, NumberFault> {
     if spelt_out { Err(NumberFault::NotFinite) } else { Ok(value) }
 }
 
-/// Parses a number that contains the decimal mark `mark` (a point or a comma). If `group` is given, the digits before
-/// the mark must be in groups of three, separated by `group`. If `group` is `None`, thousands separators are rejected.
+/// Parses `field`, a number that contains the decimal mark `mark` (a point or a comma). If `group` is given, the digits
+/// before the mark must be in groups of three, separated by the byte `group`. If `group` is `None`, thousands
+/// separators are rejected.
+///
+/// # Errors
+/// [`NumberFault::Text`] if `field` does not have this form or is too long; [`NumberFault::NotFinite`] if it is the
+/// word for NaN or infinity.
 fn plain_with_point(field: &[u8], mark: u8, group: Option<u8>) -> Result<f64, NumberFault> {
     let at = field.iter().position(|&b| b == mark).ok_or(NumberFault::Text)?;
     let (whole, fraction) = (&field[..at], &field[at + 1..]);

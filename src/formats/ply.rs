@@ -27,7 +27,8 @@ pub struct PlyFile {
     pub degenerate: usize,
 }
 
-/// Reads a PLY file of at most 1 GiB.
+/// Reads a PLY file of at most 1 GiB. Returns its vertices in millimetres, their normals if the file has them, and its
+/// faces as triangles.
 ///
 /// # Errors
 /// A file that is not readable, not PLY, malformed or cut, or that has content after its end; a vertex that is not
@@ -36,7 +37,8 @@ pub fn read_ply(path: impl AsRef<Path>) -> Result<PlyFile, FormatError> {
     open(path.as_ref())?.parse(path.as_ref(), parse_ply)
 }
 
-/// Parses the bytes of a PLY file; `path` only names the file in messages.
+/// Parses `bytes`, the content of a PLY file. Returns its vertices in millimetres, their normals if the file has them,
+/// and its faces as triangles. `path` only names the file in messages.
 ///
 /// # Errors
 /// The same as for [`read_ply`].
@@ -44,12 +46,14 @@ pub fn parse_ply(path: &Path, bytes: &[u8]) -> Result<PlyFile, FormatError> {
     parse_ply_in(path, bytes, [Unit::Millimetre; 2])
 }
 
-/// Parses a PLY file from its `bytes`. The coordinates stay in the unit of the file. `units` are the unit of all
-/// coordinates, and the unit of z. The file is rejected if a comment in its header states another unit. `path` only
-/// names the file in messages.
+/// Parses `bytes`, the content of a PLY file. Returns its vertices, their normals if the file has them, and its faces
+/// as triangles. The coordinates stay in the unit of the file.
+///
+/// `units` holds two expected units: first the unit of all coordinates, then the unit of z. The file is rejected if a
+/// comment in its header states another unit. `path` only names the file in messages.
 ///
 /// # Errors
-/// The same as for [`read_ply`].
+/// The same as for [`read_ply`]; a comment with another unit.
 pub(super) fn parse_ply_in(path: &Path, bytes: &[u8], units: [Unit; 2]) -> Result<PlyFile, FormatError> {
     let header = Header::parse(path, bytes, units)?;
     let data = &bytes[header.length..];

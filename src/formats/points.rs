@@ -136,9 +136,12 @@ struct Grouped {
 }
 
 impl Grouped {
-    /// Counts `line` if one of its coordinates has points or commas between thousands, and stores the first such
-    /// number. Does nothing if two lines are already counted. `lines_before` is the number of lines before `line` in
-    /// the text that is parsed.
+    /// Checks `line` for numbers with thousands separators (points or commas between thousands). If a coordinate in
+    /// `line` has such separators, the counter of such lines increases by 1. The first such number in the text is
+    /// stored, with its value and with `lines_before`, the number of lines before `line`. `layout` gives the columns
+    /// and the decimal mark.
+    ///
+    /// Does nothing if two lines are already counted, because only the cases none, one and several lines matter.
     fn see(&mut self, line: &[u8], layout: &Layout, lines_before: u64) {
         if self.lines > 1 || !has_both_marks(line) {
             return;
@@ -151,8 +154,10 @@ impl Grouped {
         }
     }
 
-    /// Adds the count and the first number with thousands separators that were found in a part of the text. `share` is
-    /// the result for this part, and `lines_before` is the number of lines of the file before this part.
+    /// Adds `share`, the result for one part of the file, to this result for the whole file. Each result has two
+    /// values: the number of lines that contain numbers with thousands separators, and the first number with such
+    /// separators. The two numbers of lines are added. The first number of `share` is stored only if no number is
+    /// stored yet. `lines_before` is the number of lines of the file before this part.
     fn add(&mut self, share: Self, lines_before: u64) {
         self.lines += share.lines;
         let first = share.first.map(|(line, found, value)| (line + lines_before, found, value));
@@ -258,12 +263,12 @@ impl<'p> Cloud<'p> {
         Some(PointNote::NoLineEnd { path, line, found, point, fewer_digits })
     }
 
-    /// Returns the number of bytes from the beginning of the text in `batch` to the end of its last complete line.
+    /// Returns the number of bytes in `batch` from the beginning of its text to the end of the last complete line.
     /// `batch` must be full.
     ///
     /// # Errors
-    /// An incomplete last line that is longer than the limit for a line; an error in the lines before such a line,
-    /// which are then parsed first.
+    /// An incomplete last line that is longer than the limit for a line. Before this error is returned, the complete
+    /// lines are parsed, and an error in one of them is returned instead.
     fn whole_lines(&mut self, batch: &Batch) -> Result<usize, FormatError> {
         let text = &batch.bytes[batch.begin..];
         let lines = text.iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);

@@ -119,8 +119,10 @@ fn from_yaml(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<Vec<Refer
     }
 }
 
-/// Returns the list of points named `group` in `root`, the tree of a YAML file. If `group` is `None`, returns the only
-/// list. If `root` has no named lists, returns `root` itself.
+/// Returns a list of points from `root`, the tree of a YAML file. If `root` is a mapping (names with values), returns
+/// the list with the name `group`. If `group` is `None`, the mapping must have exactly one list, and this list is
+/// returned. If `root` is not a mapping, returns `root` itself, whatever `group` is. `path` only names the file in
+/// messages.
 ///
 /// # Errors
 /// No list with this name; no list, or several lists, if `group` is `None`.
@@ -168,7 +170,9 @@ fn position(path: &Path, node: &Node) -> Result<Point, FormatError> {
     Ok(Point::new(number(x)?, number(y)?, number(z)?))
 }
 
-/// Parses a YAML file into a tree of nodes. Only the first document in the file is used.
+/// Parses `text`, the content of a YAML file, and returns its first document as a tree of nodes. Later documents in the
+/// file are ignored. `path` only names the file in messages. Returns an error if the YAML is empty or not valid,
+/// contains an alias, or has lists that are nested too deep.
 fn tree(path: &Path, text: &str) -> Result<Node, FormatError> {
     let mut open: Vec<Node> = Vec::new();
     for event in Parser::new_from_str(text) {

@@ -123,7 +123,8 @@ pub fn write_json_atomic(path: impl AsRef<Path>, value: &impl Serialize) -> Resu
     write_atomic(path, &text)
 }
 
-/// Writes a file completely or not at all.
+/// Writes `bytes` to the file `path`, completely or not at all (atomically). Replaces an existing file. If an error
+/// occurs while the bytes are written, an existing file stays unchanged.
 ///
 /// # Errors
 /// A file that cannot be written.
@@ -152,8 +153,9 @@ pub fn try_writing(folder: &Path) -> Result<(), FormatError> {
     Draft::create(&folder.join("probe")).map(drop)
 }
 
-/// Writes a header and `rows`, comma-separated, to `path`. `cells` returns the numbers of a row, and optionally a flag,
-/// which is written last as 1 or 0.
+/// Writes a table to the file `path`, with commas between the columns. The first line is `header`, and one line per
+/// item of `rows` follows. The function `cells` returns the numbers of one row, and a flag or `None`. A flag is written
+/// as an additional last column: 1 if it is true, 0 if it is false.
 ///
 /// # Errors
 /// A row with NaN or an infinity; a file that cannot be written.
@@ -213,8 +215,9 @@ impl<'p> Draft<'p> {
         Self::create_by(path, |temporary| OpenOptions::new().write(true).create_new(true).open(temporary))
     }
 
-    /// Creates a temporary file that only its owner can read. It replaces the file `path` when it is published, and is
-    /// removed if it is not.
+    /// Creates a temporary file in the folder of `path`. Only the owner can read the temporary file. [`Self::publish`]
+    /// renames the temporary file to `path`. If `publish` is not called, the temporary file is removed when this value
+    /// is dropped. Returns an error if `path` is a folder, a device or a pipe, or if the file cannot be created.
     fn create_private(path: &'p Path) -> Result<Self, FormatError> {
         Self::create_by(path, system::create_owners)
     }

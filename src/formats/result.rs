@@ -361,10 +361,11 @@ fn other_column_indices(names: &[String]) -> [Option<usize>; 5] {
 }
 
 impl OtherColumns {
-    /// Reads the columns other than the coordinates (such as index, name and probe radius) from `text`, the content of
-    /// a table. `points` is the number of points of the table. `decimal` is the decimal mark; if it is `None`, the mark
-    /// is detected. `table` gives the columns and units that the file does not state. All columns are missing in the
-    /// result if the header names none of them.
+    /// Reads the columns other than the coordinates from `text`, the content of a table: index, name, enabled, and the
+    /// radius or diameter of the probe. `points` is the number of points in the table. `decimal` is the decimal mark.
+    /// If `decimal` is `None`, the mark is detected from the numbers. `table` has the columns and units that a person
+    /// gave, because the file does not state them clearly. Returns an empty value if the header names none of these
+    /// columns.
     ///
     /// # Errors
     /// An index that is not a whole number; more than one probe; a probe of an impossible size.
@@ -426,8 +427,9 @@ impl OtherColumns {
     }
 }
 
-/// Parses `text`, the radius or the diameter of a probe in millimetres. The number has the decimal mark in `layout`, or
-/// a decimal point.
+/// Parses `text`, the radius or the diameter of a probe, and returns the size in millimetres. First reads `text` with
+/// the decimal mark of the table, which `layout` contains. If this fails, reads `text` with a decimal point. `path`
+/// only names the file in messages.
 ///
 /// # Errors
 /// A text that is not a number above 0.

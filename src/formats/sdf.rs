@@ -39,10 +39,11 @@ pub fn read_sdf(path: impl AsRef<Path>) -> Result<HeightMap, FormatError> {
     parse_sdf(path, &opened.read_all(path, MAX_BYTES)?)
 }
 
-/// Parses the bytes of an SDF file; `path` only names the file in messages.
+/// Parses `bytes`, the content of an SDF file. Returns the heights on a grid, in millimetres. `path` only names the
+/// file in messages.
 ///
 /// # Errors
-/// The same as for [`read_sdf`].
+/// The same as for [`read_sdf`], except that the file is not readable.
 pub fn parse_sdf(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     check_version(path, bytes)?;
     if bytes[0] == b'a' { parse_text(path, bytes) } else { parse_binary(path, bytes) }
@@ -76,7 +77,10 @@ struct Header {
 }
 
 impl Header {
-    /// Creates the header from the values of its fields, in the order of [`FIELDS`], and rejects impossible values.
+    /// Creates the header of an SDF map from `fields`, the values of its eight fields. The order of the values is that
+    /// of the names in [`FIELDS`]: from `NumPoints` (number of columns) to `CheckType`. Returns an error if a value is
+    /// impossible: a size that is not a whole number above 0 or is too large, a scale that is not a finite number above
+    /// 0, compressed heights, an unknown check type, or an unknown data type. `path` only names the file in messages.
     fn new(path: &Path, fields: [f64; 8]) -> Result<Self, FormatError> {
         let [columns, rows, x, y, z, compression, kind, check] = fields;
         let field = |k: usize, expected: &str| unexpected(path, FIELDS[k], expected, fields[k].to_string());
@@ -141,8 +145,10 @@ fn parse_binary(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     header.map(path, raw.chunks_exact(size).map(|at| Ok(binary_value(kind, at))))
 }
 
-/// Parses a height from its bytes `at`. Returns it as a number of steps; the header gives the length of a step. `kind`
-/// is the data type of SDF, 0 to 7. Returns `None` if the value marks a sample that was not measured.
+/// Parses one height of a binary SDF file from `at`, the bytes that begin with this height. Returns the height as a
+/// number of steps, because the header of the file gives the length of one step. `kind` is the data type of SDF, a
+/// number from 0 to 7. Returns `None` if the sample was not measured: the number is the one that the data type reserves
+/// for this, or it is not finite.
 fn binary_value(kind: u8, at: &[u8]) -> Option<f64> {
     let two = || at.first_chunk().copied().unwrap_or_default();
     let four = || at.first_chunk().copied().unwrap_or_default();

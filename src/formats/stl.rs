@@ -49,10 +49,11 @@ pub fn read_stl(path: impl AsRef<Path>) -> Result<StlFile, FormatError> {
     parse_stl(path, &opened.read_all(path, MAX_BYTES)?)
 }
 
-/// Parses the bytes of an STL file; `path` only names the file in messages.
+/// Parses `bytes`, the content of an STL file. Returns the triangles with merged vertices, in millimetres. `path` only
+/// names the file in messages.
 ///
 /// # Errors
-/// The same as for [`read_stl`].
+/// The same as for [`read_stl`], except that the file is not readable.
 pub fn parse_stl(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
     let kind = kind(path, bytes, bytes.len() as u64)?;
     let first_line = bytes[..bytes.len().min(80)].split(|&b| b == b'\n').next().unwrap_or_default();
@@ -63,8 +64,9 @@ pub fn parse_stl(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
     }
 }
 
-/// Returns true if a file with the beginning `head` and `length` bytes is STL: it begins like ascii STL, or its length
-/// matches the facet count of a binary header.
+/// Returns true if a file is STL. `head` is the beginning of the file, and `length` is the length of the whole file in
+/// bytes. The file is STL if one of two conditions is true: `head` begins like ascii STL, or `head` is a binary header
+/// whose number of facets is above 0 and matches `length`.
 pub(super) fn is_stl(head: &[u8], length: u64) -> bool {
     looks_ascii(head) || (facets(head).is_some_and(|n| n > 0) && binary_length(head) == Some(length))
 }
@@ -198,9 +200,9 @@ impl<'a> Words<'a> {
         if right { Ok(()) } else { Err(self.unexpected(&format!("`{wanted}`"), word, [wanted; 3])) }
     }
 
-    /// Returns the error for `word`, which is not one of the words in `wanted`. `expected` is the expected content, for
-    /// the message. If the file ends after `word`, and `word` is the beginning of a word in `wanted`, the error states
-    /// that the file is cut.
+    /// Returns an error that reports `word`, a word of the file that is not in `wanted`, the permitted words.
+    /// `expected` describes the expected content in the message. If the file ends after `word`, and `word` is the
+    /// beginning of a permitted word, the error reports a cut file.
     fn unexpected(&self, expected: &str, word: &[u8], wanted: [&str; 3]) -> FormatError {
         let (path, place) = (self.path.to_owned(), format!("line {}", self.line));
         let begun = |w: &str| w.as_bytes().get(..word.len()).is_some_and(|part| part.eq_ignore_ascii_case(word));
@@ -210,14 +212,16 @@ impl<'a> Words<'a> {
         FormatError::Unexpected { path, place, expected: expected.to_owned(), found: excerpt(word) }
     }
 
-    /// Skips the rest of the line: the name of the solid after `solid` and `endsolid`.
+    /// Skips the rest of the current line. This is used after the words `solid` and `endsolid`, where the line can
+    /// contain the name of the solid.
     fn skip_line(&mut self) {
         let end = self.rest.iter().position(|&b| b == b'\n').unwrap_or(self.rest.len());
         self.rest = &self.rest[end..];
     }
 
-    /// Reads a facet from the word after `facet` to `endfacet`. Returns its three corners, in millimetres. The normal
-    /// is skipped. Returns an error if another word or an invalid coordinate is found.
+    /// Reads a facet, whose first word `facet` is already read, until its last word `endfacet`. Returns the three
+    /// corners, in millimetres. The three numbers of the normal are skipped. Returns an error if a word is not the
+    /// expected one, a coordinate is not valid, or the file ends.
     fn facet(&mut self) -> Result<[Point; 3], FormatError> {
         self.expect("normal")?;
         for _ in 0..3 {

@@ -23,7 +23,8 @@ pub(super) struct Opened {
     pub(super) head: Vec<u8>,
 }
 
-/// Opens a file and reads its first bytes, at most 64 KiB.
+/// Opens the file `path` and reads its first bytes, at most 64 KiB. Returns the open file, its length in bytes (0 for a
+/// pipe), and these first bytes.
 ///
 /// # Errors
 /// A file that cannot be read.
@@ -46,7 +47,8 @@ pub fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
 }
 
 impl Opened {
-    /// Returns all bytes of the file; `path` only names it in messages.
+    /// Returns all bytes of this opened file, including the first bytes that are already read. `limit` is the maximum
+    /// number of bytes. `path` only names the file in messages.
     ///
     /// # Errors
     /// A file that cannot be read, or that has more than `limit` bytes.
@@ -63,13 +65,15 @@ impl Opened {
         if found > limit { Err(too_large(found)) } else { Ok(self.head) }
     }
 
-    /// Parses a file with the function `parse`, and returns its result. If the file is longer than 64 KiB, `parse` is
-    /// called first with only the first 64 KiB. An error in this part is returned at once, so that a large file of
-    /// invalid content is not read. An error that states only that this part is cut is ignored. `path` only names the
-    /// file in messages.
+    /// Parses this opened file with the function `parse`, and returns the result of `parse`. `parse` gets `path` and
+    /// the bytes of the file. `path` only names the file in messages.
+    ///
+    /// If at least 64 KiB were read, `parse` is first called with only the first 64 KiB. An error of this first call is
+    /// returned at once, so that a large file of invalid content is not read to its end. One error is ignored: that the
+    /// bytes end too early.
     ///
     /// # Errors
-    /// The first error of `parse`; a file that cannot be read or is larger than 1 GiB.
+    /// The first error of `parse` that is not ignored; a file that cannot be read or is larger than 1 GiB.
     pub(super) fn parse<T>(
         self,
         path: &Path,

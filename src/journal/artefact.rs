@@ -36,10 +36,12 @@ impl Artefact {
         describe(&path, name)
     }
 
-    /// Returns the content of the file in the run folder `folder`, if its length and its hash are those on record.
+    /// Reads the file that this value describes (name, length and hash) from the run folder `folder`. Returns the
+    /// content of the file.
     ///
     /// # Errors
-    /// The file cannot be read; [`JournalError::OtherFile`] if its content differs from the record.
+    /// The file cannot be read. [`JournalError::OtherFile`] if the length or the hash of the content differs from that
+    /// in this value.
     pub fn read(&self, folder: &Path) -> Result<Vec<u8>, JournalError> {
         let path = path_within(folder, &self.name)?;
         let mut bytes = Vec::new();
@@ -64,8 +66,8 @@ pub(super) fn path_within(folder: &Path, name: &str) -> Result<PathBuf, JournalE
     Ok(folder.join(name))
 }
 
-/// Returns the temporary name of a file while it is written. A temporary file that a crash left stays until the next
-/// write of the same file overwrites it.
+/// Returns the name that the file `name` has while it is being written, such as `.part.json.tmp` for `part.json`. After
+/// a crash, a file with this temporary name can remain. The next write of the file `name` overwrites it.
 pub(super) fn temporary_name(name: &str) -> String {
     format!(".{name}.tmp")
 }

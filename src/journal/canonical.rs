@@ -66,9 +66,9 @@ pub fn sha256_hex(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
 }
 
-/// Returns the hash of a record as 64 lowercase hexadecimal digits. The hash is the SHA-256 of four texts in a row:
-/// [`DOMAIN`], `prev_hash`, a line feed, and `text`. `prev_hash` is the hash of the record before. `text` is the JSON
-/// text of this record without its hashes.
+/// Returns the hash of a record: a SHA-256 as 64 lowercase hexadecimal digits. `text` is the JSON text of this record
+/// without its hashes. `prev_hash` is the hash of the previous record. The hash is computed from four texts, one after
+/// the other: [`DOMAIN`] (a constant line that states the purpose of the hash), `prev_hash`, a line feed, and `text`.
 pub(super) fn chain(prev_hash: &str, text: &str) -> String {
     let mut digest = Sha256::new();
     for part in [DOMAIN, prev_hash, "\n", text] {

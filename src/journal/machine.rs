@@ -61,9 +61,10 @@ impl MachineLock {
         Self::acquire_in(&system::place_of_locks(FOLDER).unwrap_or_else(std::env::temp_dir), address, run)
     }
 
-    /// Returns a new epoch for `machines`, and stores the epoch in the lock files of the machines. An epoch is a number
-    /// that identifies a session of a client with a machine. The new epoch is higher than every epoch that these files
-    /// contained when the machines were locked, and at least `clock`, the current time in seconds.
+    /// Returns a new epoch for `machines`, the locked machines of one run. An epoch is a number that identifies a
+    /// session of a client with a machine. Stores the new epoch in the lock files of these machines. `clock` is the
+    /// current time in seconds. The new epoch is at least `clock`. It is also higher than every epoch that was stored
+    /// in the lock files when the machines were locked.
     pub fn epoch<'a>(machines: impl IntoIterator<Item = &'a Self> + Clone, clock: u32) -> u32 {
         let last = machines.clone().into_iter().map(|machine| machine.last_epoch).max().unwrap_or(0);
         let epoch = clock.max(last.saturating_add(1));
@@ -71,8 +72,9 @@ impl MachineLock {
         epoch
     }
 
-    /// Returns the path of the control socket, which is next to the lock file of this user. The socket gives access to
-    /// the cell that has locked this machine, even if the run folder was deleted.
+    /// Returns the path of the control socket. The socket gives access to the cell that has locked this machine. The
+    /// socket is in the same folder as the lock file of this user. Therefore the cell can still be reached if the run
+    /// folder was deleted.
     pub fn control_socket(&self) -> &Path {
         &self.control_socket
     }
@@ -143,10 +145,13 @@ impl MachineLock {
         Err(JournalError::LockFolder { path, what: lock.notes.join("; "), remedy })
     }
 
-    /// Opens the lock file `name` in `folder` with the function `open`, locks it, and reads the last epoch (session
-    /// number) from it. `path` is the path of `folder`, and `address` identifies the machine; both are used for
-    /// messages. On success `self` keeps the lock. The inner `Err` is the reason why the entry `name` cannot be used as
-    /// a lock file.
+    /// Locks a machine by its lock file `name` in `folder`, and reads the last epoch (session number) from the file.
+    /// `open` is the function that opens the file. `path` is the path of `folder`, and `address` is the address of the
+    /// machine; both are only used for messages.
+    ///
+    /// Returns `Ok(Ok(()))` if the file is locked. The lock is then stored in `self`. Returns `Ok(Err(reason))` if the
+    /// entry `name` cannot be used as a lock file, for example because it is a link. The caller can then use another
+    /// name.
     ///
     /// # Errors
     /// Another process holds the lock, or the file cannot be locked.
@@ -190,8 +195,9 @@ impl MachineLock {
         Ok(Err("it is removed repeatedly".to_owned()))
     }
 
-    /// Reads the epoch (session number) from `kept`, the content of the lock file at `path`. Raises the last epoch of
-    /// this lock if the epoch read is higher. Ignores a value that is not a number or is too large, and adds a warning.
+    /// Reads the epoch (session number) from `kept`, the content of a lock file. If this epoch is higher than the last
+    /// epoch of this lock, replaces the last epoch by it. If the value is not a number or is too large, ignores it and
+    /// adds a warning. `path` is the path of the lock file, for the warning.
     fn read_epoch(&mut self, kept: &str, path: &Path) {
         for text in kept.lines().filter_map(|line| line.strip_prefix(EPOCH)) {
             match text.trim().parse::<u32>() {
@@ -205,9 +211,9 @@ impl MachineLock {
         self.notes.push(format!("{}: {what}; it was ignored", path.display()));
     }
 
-    /// Writes the holder (run folder and process number) and `epoch` (the session number) into the lock files. Ignores
-    /// write errors, because the lock is valid without this content. The holder is only information for people, and the
-    /// machine also reports its last epoch.
+    /// Writes the holder (run folder and process number) and `epoch` (the session number) into the lock files of this
+    /// machine. Ignores write errors, because the lock is valid without this content. The holder is only information
+    /// for people. The stored epoch is not the only source of the last epoch, because the machine also reports it.
     fn write(&self, epoch: u32) {
         let text = format!("{}\n{EPOCH}{epoch}\n", self.holder);
         for mut file in &self.holder_files {

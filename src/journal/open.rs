@@ -56,8 +56,9 @@ pub(super) fn create(folder: &Path) -> Result<Connection, JournalError> {
     Ok(connection)
 }
 
-/// Sets what happens to the write-ahead log when the database is closed: it stays if `keeps` is true, and is written
-/// into the database and deleted if `keeps` is false. After a crash it stays in both cases.
+/// Sets what SQLite does with the write-ahead log when the database is closed. If `keeps` is true, the log file stays.
+/// If `keeps` is false, the content of the log is written into the database, and the log file is deleted. After a
+/// crash, the log file stays in both cases.
 pub(super) fn keep_the_log(connection: &Connection, keeps: bool) -> rusqlite::Result<()> {
     connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, keeps).map(drop)
 }
@@ -118,8 +119,9 @@ fn check_schema(connection: &Connection, path: &Path) -> Result<(), JournalError
     if has_table { Ok(()) } else { Err(foreign("it has no table of records")) }
 }
 
-/// Returns the SQL statements that create the tables, indices and triggers of a journal. Each run of white space is
-/// replaced by one blank, so that the statements can be compared with those of a database.
+/// Returns the SQL statements that create the tables, indices and triggers of a journal. Each sequence of white space
+/// is replaced by one blank. The statements can then be compared with the statements that an existing database
+/// contains.
 fn statements() -> impl Iterator<Item = String> {
     // The statement of a trigger contains a semicolon, so the schema is not split at semicolons.
     SCHEMA
@@ -189,11 +191,11 @@ fn address(path: &Path) -> String {
     address + "?immutable=1"
 }
 
-/// Checks the header of the database file at `path` before SQLite opens the file. Returns the version of the table
-/// layout. `folder` is the run folder.
+/// Checks the header of the database file `path`, before SQLite opens the file. Returns the version of the table layout
+/// from the header. `folder` is the run folder, for messages.
 ///
-/// The process that writes this journal must not call this function. The function opens and closes the file, and a
-/// process that closes a file releases all its locks on that file.
+/// A process that has the journal in this folder open for writing must not call this function. The function opens and
+/// closes the file. A process that closes a file releases all its locks on that file.
 ///
 /// # Errors
 /// The file does not exist; it is not a journal; it was written by a later version.
@@ -224,7 +226,9 @@ fn recognise(folder: &Path, path: &Path) -> Result<u32, JournalError> {
     }
 }
 
-/// Applies the database settings on which durability and safety depend, and reads each one back.
+/// Applies the SQLite settings of a journal: the timeout for a busy database, the write-ahead log, a flush to the disk
+/// after every transaction, foreign keys, and protection against a manipulated database file. Reads back each setting
+/// that is a `PRAGMA`, to check that SQLite accepted it. `path` only names the database in messages.
 ///
 /// # Errors
 /// [`JournalError::Setting`] if the database did not accept a setting.

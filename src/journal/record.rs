@@ -384,8 +384,8 @@ impl Iterator for Records<'_> {
     }
 }
 
-/// Converts `number` to a signed 64-bit integer, because the database has no unsigned integers. A number above the
-/// largest signed integer is replaced by that integer. As nanoseconds, the largest integer is 292 years.
+/// Converts `number` to a signed 64-bit integer, because the database has no unsigned integers. A number above
+/// [`i64::MAX`] is replaced by [`i64::MAX`]. For a time in nanoseconds, this limit is 292 years.
 pub(super) fn signed(number: u64) -> i64 {
     i64::try_from(number).unwrap_or(i64::MAX)
 }

@@ -92,9 +92,9 @@ pub struct Verified {
 }
 
 impl Verified {
-    /// Returns true if the end of a signed run is not signed: the run names a key and has its end record, but no seal
-    /// (signature record) follows the end record. Somebody without the key could then have written the end record.
-    /// While a process drives the run, this process can still add the seal.
+    /// Returns true if the end of a signed run is not signed. This means: the run names a public key and has an end
+    /// record, but no seal (signature record) follows the end record. In this case, somebody without the secret key
+    /// could have written the end record. While a process drives the run, this process can still add the seal.
     pub fn lacks_last_seal(&self) -> bool {
         !self.keys.is_empty() && self.closed && self.signed + 1 != self.records
     }

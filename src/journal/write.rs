@@ -91,8 +91,9 @@ impl Journal {
         Self::create_with(folder, header, None)
     }
 
-    /// Creates the folder and the journal of a new run as [`Journal::create`] does. With a `key`, the journal is signed
-    /// at its beginning, after every [`SEALED_EVERY`] records, and at its end. Without a `key`, nothing is signed.
+    /// Creates the folder and the journal of a new run as [`Journal::create`] does. `key` is the secret key that signs
+    /// the journal. With a `key`, the journal is signed at its beginning, again each time [`SEALED_EVERY`] more records
+    /// (256) are written, and at its end. Without a `key`, nothing is signed.
     ///
     /// # Errors
     /// Those of [`Journal::create`].
@@ -132,9 +133,11 @@ impl Journal {
         Ok(journal)
     }
 
-    /// Opens the journal of a run to continue the run, and adds a record of the opening. Before that, checks the hash
-    /// chain from the record that the anchor file names to the last record. Without an anchor file, checks the whole
-    /// chain; [`super::verify()`] always checks the whole chain. New records are not signed.
+    /// Opens the journal of a run to continue the run, and adds a record of the opening. New records are not signed.
+    ///
+    /// Before that, checks the hash chain of the records. If there is an anchor file (number of records and hash of the
+    /// last one), checks only the records from the last record of the anchor on. Without an anchor file, checks all
+    /// records. [`super::verify()`] always checks all records.
     ///
     /// # Errors
     /// The folder has no journal. The journal is in use by another process, ended, damaged or changed, or the database
@@ -196,9 +199,10 @@ impl Journal {
         &self.part
     }
 
-    /// Checks that the database, its log and the lock file are still the same files as at the first call. The first
-    /// call only remembers the files. This check is necessary because a deleted file that is still open accepts every
-    /// write, but the written content is lost.
+    /// Checks that three files of the journal were not removed or replaced: the database, its write-ahead log and the
+    /// lock file. The first call only remembers which files are present. Each later call compares the files with these.
+    /// This check is necessary because the operating system accepts writes to a deleted file that is still open, but
+    /// the written content is lost.
     ///
     /// # Errors
     /// [`JournalError::Gone`] with the path of a file that is missing or was replaced. A file cannot be inspected.
@@ -383,9 +387,10 @@ impl Journal {
         self.seal.as_ref().map_or(0, |seal| seal.records + 1)
     }
 
-    /// Writes the anchor file (number of records and hash of the last one), and returns the anchor. The anchor is that
-    /// of the newest seal (signature record) since the journal was opened. If there is no seal, the anchor is that of
-    /// the last record, without a signature.
+    /// Writes the anchor file (number of records, hash of the last one, and optionally a signature), and returns this
+    /// anchor. If a seal (signature record) was written since the journal was opened, the number, the hash and the
+    /// signature are those of the newest seal. Otherwise the anchor has the number and the hash of the last record, and
+    /// no signature.
     fn write_anchor(&mut self) -> Result<Anchor, JournalError> {
         let anchor = match &self.seal {
             Some(seal) => Anchor::sealed(&self.run, seal),
@@ -398,12 +403,12 @@ impl Journal {
         Ok(anchor)
     }
 
-    /// Adds a seal (signature record) if the journal has a key and the last [`SEALED_EVERY`] records have no seal.
-    /// Writes the anchor file if [`SEALED_EVERY`] records were added since the last anchor. Does nothing after the end
-    /// record.
+    /// Adds a seal (signature record) if the journal has a key and at least [`SEALED_EVERY`] records (256) were added
+    /// since the last seal. Writes the anchor file (number of records and hash of the last one) if at least
+    /// [`SEALED_EVERY`] records were added since the last anchor. Does nothing after the end record.
     ///
-    /// Ignores errors, because they do not affect the records already written. The next append tries again, and the end
-    /// of the run at the latest.
+    /// Ignores errors, because they do not affect the records already written. The next append, or the end of the run,
+    /// tries again.
     fn seal_when_due(&mut self) {
         if self.tail.closed {
             return;
@@ -472,9 +477,9 @@ impl Journal {
         r.put_into(&self.connection).map_err(JournalError::database(&self.folder))
     }
 
-    /// Finds out whether the last write was stored, if that write reported an error. For this, reads the last record of
-    /// the database again. Returns the record of the failed write if it was stored. Returns `None` if it was not
-    /// stored, or if the last write did not fail.
+    /// Checks whether a record was stored although its write reported an error. Does nothing and returns `None` if the
+    /// last write had no error. Otherwise reads the last record of the database again. Returns the record of the failed
+    /// write if it is the last record of the database. Returns `None` if that record was not stored.
     fn reread_tail(&mut self) -> Result<Option<Record>, JournalError> {
         let Some(record) = &self.doubtful else { return Ok(None) };
         self.tail = read_tail(&self.connection, &self.folder)?;

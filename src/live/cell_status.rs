@@ -44,8 +44,8 @@ pub struct EndedRun {
 }
 
 impl CellStatus {
-    /// Returns the name of the current run. This is a run that is active, a run whose program does not answer, or a run
-    /// without an end record whose program is gone. Returns `None` if there is no such run.
+    /// Returns the name of the current run. The current run has one of three states: it is active, its program does not
+    /// answer, or its program has ended without an end record. Returns `None` if there is no current run.
     pub(crate) fn run(&self) -> Option<&str> {
         match &self.run_status {
             RunStatus::NoRun => None,
@@ -55,7 +55,8 @@ impl CellStatus {
         }
     }
 
-    /// Returns the snapshot of the active run; `None` without an active run.
+    /// Returns the snapshot (the state of the running cell at one time) of the active run. Returns `None` if no run is
+    /// active. A run whose program does not answer or has ended is not active.
     pub(crate) fn snapshot(&self) -> Option<&Snapshot> {
         match &self.run_status {
             RunStatus::Active { snapshot, .. } => Some(snapshot),

@@ -25,7 +25,8 @@ impl PublisherLock {
         Ok(held.map(|held| Self { folder: folder.to_owned(), _held: held }))
     }
 
-    /// Returns the folder for the persistent state of publishers.
+    /// Returns the folder of this lock, in which publishers store their persistent files, such as certificates and the
+    /// connection counter.
     pub(crate) fn folder(&self) -> &Path {
         &self.folder
     }

@@ -102,7 +102,9 @@ fn drawn(line: &Line, scale: &Scale, language: Language) -> Markup {
     }
 }
 
-/// Returns the values of the chart as text, for a screen reader.
+/// Returns the values of the chart as one text for a screen reader. `lines` are the PV and RMS curves of the chart. The
+/// text contains the name of each curve and, for each cycle, the number of the cycle and the value in µm. `language` is
+/// the language of the word "cycle".
 fn words(lines: &[Line], language: Language) -> String {
     let of = |line: &Line| {
         let points =
@@ -121,7 +123,9 @@ struct Scale {
 }
 
 impl Scale {
-    /// Returns a scale on which all points, limits and forecasts are visible; `None` if there is no point.
+    /// Returns a scale for the curves `lines` of the chart. The horizontal axis covers all measured and forecast
+    /// cycles. The vertical axis covers all measured values and limits. A forecast above this range is drawn at the
+    /// upper edge of the chart. Returns `None` if no curve has a measured point.
     fn fitting(lines: &[Line]) -> Option<Self> {
         let all = || lines.iter().flat_map(|line| &line.points);
         let first = all().map(|(cycle, ..)| *cycle).min()?;

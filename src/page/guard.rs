@@ -87,7 +87,8 @@ impl Entrance {
         is_here && at == Some(port)
     }
 
-    /// Returns the address (URL) with which a browser opens the page, without a key.
+    /// Returns the address (URL) at which a browser opens the page. The host is a name from the TLS certificate, if
+    /// there is one, and otherwise the address of the page. The result does not contain the access key of the page.
     fn base(&self) -> String {
         let name = self.tls.as_ref().and_then(Tls::name);
         let at = name.map_or(self.address.to_string(), |name| format!("{name}:{}", self.address.port()));
@@ -129,14 +130,16 @@ impl Rate {
         self.began.elapsed() > MINUTE
     }
 
-    /// Returns the time since the current counting interval began. An interval lasts at least one minute; the next
-    /// interval begins with the first event after this minute.
+    /// Returns the age of the current counting interval: the time since it began. The counted events are, for example,
+    /// refused requests or attempts to sign in. An interval lasts at least one minute. The next interval begins with
+    /// the first event after this minute.
     pub(crate) fn age(&self) -> Duration {
         self.began.elapsed()
     }
 
-    /// Returns the number of events in the current counting interval. An interval lasts at least one minute; the next
-    /// interval begins with the first event after this minute.
+    /// Returns the number of events in the current counting interval. The counted events are, for example, refused
+    /// requests or attempts to sign in. An interval lasts at least one minute. The next interval begins with the first
+    /// event after this minute.
     pub(crate) fn current_count(&self) -> u32 {
         self.count
     }
@@ -242,8 +245,9 @@ impl Guard {
         found.and_then(|at| tokens.remove(at)).is_some()
     }
 
-    /// Returns true if the browser of `session` still has access: always without a list of users, and otherwise as long
-    /// as the person is signed in with the same name and role.
+    /// Returns true if the browser of `session` still has access to the page. If the page has no list of users, the
+    /// result is always true. If the page has a list of users, the result is true as long as the person is signed in
+    /// and has the same name and role as in `session`.
     pub(crate) fn has_access(&self, session: &Session) -> bool {
         let person = |users| self.signed_in.person(&session.id, users);
         self.entrance.users.as_ref().is_none_or(|users| person(users) == session.person)

@@ -176,7 +176,8 @@ impl Drop for Place {
     }
 }
 
-/// Serves all HTTP requests on the connection `stream`, until it ends.
+/// Serves all HTTP requests on the connection `stream` until the connection ends. `service` creates the response to
+/// each request. `peer` contains the address of the client; the function attaches it to each request as an extension.
 async fn answer(
     stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
     peer: Peer,

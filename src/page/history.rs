@@ -30,8 +30,9 @@ impl History {
         Self { runs, read: Mutex::default() }
     }
 
-    /// Returns the folder of the run with this name; `None` if there is no such run, or if the name could lead out of
-    /// the folder of all runs.
+    /// Returns the folder of the run named `id`. Returns `None` if there is no such run. Also returns `None` if `id` is
+    /// not a plain folder name, for example if it contains a slash or begins with a dot. Such a name could give access
+    /// to files outside the folder of all runs.
     pub(crate) fn folder(&self, id: &str) -> Option<PathBuf> {
         let plain = !id.is_empty() && !id.starts_with('.') && !id.contains(['/', '\\', '\0', ':']);
         let folder = self.runs.join(id);

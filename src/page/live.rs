@@ -112,8 +112,9 @@ async fn read(folder: &Path, history: &Arc<History>) -> Arc<RunSummary> {
     spawn_blocking(move || history.summary(&folder)).await.ok().flatten().unwrap_or_default()
 }
 
-/// Returns true if the part of the run was accepted. Returns false if it was not, or if the run was stopped or aborted.
-/// Returns `None` if the run has no result yet.
+/// Returns true if the part of the run was accepted. Returns false if the part was not accepted, or if the run was
+/// stopped or aborted. Returns `None` if the run is still open, or if its result is `RunResult::Recovery`. `seen` is
+/// the current status of the run.
 pub(crate) fn verdict(seen: &ObservedRun) -> Option<bool> {
     match seen.summary.result {
         RunResult::Accepted => Some(true),

@@ -147,7 +147,9 @@ fn answered(reply: std::io::Result<Reply>) -> Response {
     }
 }
 
-/// Answers with the given status and the reason `what`, after the refusal is on record in the run.
+/// Refuses a request that concerns the run named `run`. First sends the refusal to the record of the run, unless too
+/// many requests were refused within a minute. Then responds with the HTTP status `status`, and with the reason `what`
+/// as JSON.
 async fn refuse(page: &Shared, run: &str, what: String, status: StatusCode) -> Response {
     if page.guard.refused(&what) {
         drop(write_down(&page.history, Some(run.to_owned()), format!("the page refused {what}")).await);

@@ -103,8 +103,9 @@ fn grid_bytes(nodes: &[MapNode]) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Returns the index of a position on a regular axis. The axis begins at `first` and has the spacing `step`. `value`,
-/// `first` and `step` have the same unit. Returns `None` if `value` lies between two grid positions.
+/// Returns the index (from 0) of the grid position at `value` on a regular axis. The axis begins at `first` and has the
+/// spacing `step`. `value`, `first` and `step` have the same unit, and `value` must not be less than `first`. Returns
+/// `None` if the distance from `value` to the nearest grid position is 1 % of the spacing or more.
 fn place(value: f64, first: f64, step: f64) -> Option<usize> {
     const ROUNDING: f64 = 0.01;
     let steps = (value - first) / step;

@@ -115,8 +115,10 @@ impl SignedIn {
         self.tries.lock().unwrap_or_else(PoisonError::into_inner).remove(&(place(from), name.to_owned()));
     }
 
-    /// Reserves a slot for a password check of a client at `from`. Waits for a free slot, and returns `None` after the
-    /// timeout [`WAITS`]. The slot is released when the returned value is dropped.
+    /// Reserves a slot in the queue of password checks for a client at the address `from`. Each IPv4 address and each
+    /// IPv6 /64 network has a limited number of slots. If all slots of the client are in use, waits until one is free.
+    /// Returns `None` if no slot becomes free within the time [`WAITS`]. The slot is released when the returned value
+    /// is dropped.
     async fn wait_a_while(&self, from: IpAddr) -> Option<Waiting<'_>> {
         let began = Instant::now();
         loop {
@@ -127,8 +129,9 @@ impl SignedIn {
         }
     }
 
-    /// Reserves a slot for a password check of a client at `from`, without waiting. Returns `None` if this address or
-    /// network uses all its slots.
+    /// Reserves a slot in the queue of password checks for a client at the address `from`, without waiting. Each IPv4
+    /// address and each IPv6 /64 network has `WAITING_OF_PLACE` slots. Returns `None` if all slots of the client are in
+    /// use. The slot is released when the returned value is dropped.
     fn wait(&self, from: IpAddr) -> Option<Waiting<'_>> {
         let place = place(from);
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
@@ -223,14 +226,16 @@ pub(crate) async fn sign_in(
     response
 }
 
-/// Waits until no other password check runs, and returns the permit for this one; `None` after the timeout [`WAITS`].
+/// Waits until no other password check runs, and returns the permit to run a password check. Only one check runs at a
+/// time. The next check can begin when the permit is dropped. Returns `None` if the wait takes longer than [`WAITS`].
 async fn turn(guard: &Arc<Guard>) -> Option<OwnedSemaphorePermit> {
     let turn = Arc::clone(&guard.signed_in.proving).acquire_owned();
     tokio::time::timeout(WAITS, turn).await.ok()?.ok()
 }
 
-/// Returns the user if the name and the password in `given` are correct, otherwise `None`. Releases the permit `turn`
-/// at its end.
+/// Checks the name and the password in `given` against the list of users. Returns the user if both are correct. Returns
+/// `None` if one of them is wrong, or if the page has no list of users. `turn` is the permit to run a password check;
+/// it is released at the end of the check.
 async fn prove(guard: &Arc<Guard>, turn: OwnedSemaphorePermit, given: Credentials) -> Option<AuthenticatedUser> {
     let guard = Arc::clone(guard);
     let proven = spawn_blocking(move || {

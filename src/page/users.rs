@@ -203,7 +203,8 @@ impl Users {
         self.users.len() < before
     }
 
-    /// Returns all people on the list, by name.
+    /// Returns the name and the role of each person on the list, in the order of the list. [`Self::add`] sorts the list
+    /// by name.
     pub fn people(&self) -> impl Iterator<Item = Person> + '_ {
         self.users.iter().map(|User { name, role, .. }| Person { name: name.clone(), role: *role })
     }

@@ -131,7 +131,10 @@ fn is_over(state: StateName) -> bool {
     matches!(state, StateName::Stopped | StateName::Aborted | StateName::Complete)
 }
 
-/// Returns the HTML of the state in one word, with a shape and a colour, readable from a distance of two metres.
+/// Returns the HTML of the banner of a run. The banner shows one word with a shape and a colour, and can be read from a
+/// distance of two metres. `seen` is the current status of the run. The word is the state of the cell while the run is
+/// active, and the result of the run afterwards. If the run has no end and its program does not answer, the word is
+/// "?".
 fn banner(seen: &ObservedRun, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     let mark = |class: &str, shape: &str, word: &str, more: &str| {
@@ -286,8 +289,9 @@ fn range([least, most]: [f64; 2]) -> String {
     if least == most { format!("{most} {unit}") } else { format!("{least} – {most} {unit}") }
 }
 
-/// Returns the HTML of the active alarms. If the run has ended, or if its program does not answer, returns all alarms
-/// on record.
+/// Returns the HTML of the alarms of a run. `seen` is the current status of the run. While the run is active and its
+/// program answers, the result contains the active alarms. Otherwise it contains all alarms on record, with the times
+/// at which they were raised and withdrawn.
 fn alarms(seen: &ObservedRun, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     if let Some(live) = seen.snapshot.as_deref().filter(|live| seen.answers && !is_over(live.state)) {
@@ -318,7 +322,7 @@ fn alarms(seen: &ObservedRun, language: Language) -> Markup {
     }
 }
 
-/// Returns the HTML of an active alarm, with its consequence and its remedy.
+/// Returns the HTML of the active alarm `alarm`: its cause, its consequence, its remedy, and who can clear it.
 fn standing(alarm: &Alarm, language: Language) -> Markup {
     let (say, said) = (|text: Text| text.to(language), alarm_texts(alarm, language));
     html! {
@@ -530,7 +534,9 @@ impl RunFilter {
     }
 }
 
-/// Serves the list of runs.
+/// Serves the page with the list of runs. `wanted` is the filter from the address: only runs that match the filter are
+/// listed, and an empty field of the filter matches all runs. `session` contains the person who has signed in, and
+/// `headers` determine the language.
 pub(crate) async fn runs(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -672,7 +678,9 @@ pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, h
     }
 }
 
-/// Returns the page with the status 404, for an address that does not exist.
+/// Returns the page for an address that does not exist, with the status 404. `of` says whether the server shows one
+/// cell or the plant; it determines the links at the top of the page. `headers` are the headers of the request; they
+/// determine the language.
 pub(crate) fn not_here(of: PageSubject, headers: &HeaderMap) -> Response {
     let language = language(headers);
     let main = html! { main .list { h1 { "404" } p { (Text::NotHere.to(language)) } } };
@@ -680,7 +688,9 @@ pub(crate) fn not_here(of: PageSubject, headers: &HeaderMap) -> Response {
         .into_response()
 }
 
-/// Returns the page that asks a client without a valid key for the key, with the given status.
+/// Returns the page on which a person enters the access key. A client without a valid key gets this page. `status` is
+/// the HTTP status of the response. `of` says whether the server shows one cell or the plant; it determines the links
+/// at the top of the page. `headers` are the headers of the request; they determine the language.
 pub(crate) fn key_needed(status: StatusCode, of: PageSubject, headers: &HeaderMap) -> Response {
     let language = language(headers);
     let main = html! {
@@ -693,7 +703,9 @@ pub(crate) fn key_needed(status: StatusCode, of: PageSubject, headers: &HeaderMa
     (status, document("Regrind", &Frame { language, person: None, kind: Kind::Plain(of) }, main)).into_response()
 }
 
-/// Returns the sign-in page with the given status. `told` is the message after a sign-in that failed.
+/// Returns the sign-in page. `status` is the HTTP status of the response. `of` says whether the server shows one cell
+/// or the plant; it determines the links at the top of the page. `headers` are the headers of the request; they
+/// determine the language. `told` is the message after a failed sign-in; without a message it is `None`.
 pub(crate) fn sign_in(status: StatusCode, of: PageSubject, headers: &HeaderMap, told: Option<Text>) -> Response {
     let language = language(headers);
     let say = |text: Text| text.to(language);
@@ -753,8 +765,10 @@ impl Kind<'_> {
     }
 }
 
-/// Returns a page of the plant: `main` within the frame that all pages have. The browser reloads the page every
-/// `again_s` seconds, unless this is `None`. `style` is the address of an additional style sheet.
+/// Returns a complete web page of the plant. `main` is the content. The function adds the parts that all pages have:
+/// the title `title`, the links at the top, and the person who has signed in (from `session`). The browser reloads the
+/// page every `again_s` seconds. If `again_s` is `None`, it does not reload the page. `style` is the address of an
+/// additional style sheet.
 pub fn plant_document(title: &str, session: &Session, again_s: Option<u32>, style: &str, main: Markup) -> Response {
     let kind = Kind::Plant { again_s, style };
     document(title, &Frame { language: Language::En, person: session.person.as_ref(), kind }, main)
@@ -823,8 +837,12 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
     ([(CONTENT_TYPE, "text/html; charset=utf-8")], markup.into_string()).into_response()
 }
 
-/// Returns the language that a person chose in this browser, or else the first supported one in the preferences of the
-/// browser, or else English.
+/// Returns the language of the page for a request. `headers` are the headers of the request. The first rule that gives
+/// a language applies:
+///
+/// - the language that the person chose in this browser (stored in a cookie)
+/// - the first supported language in the header `Accept-Language`
+/// - English
 pub(crate) fn language(headers: &HeaderMap) -> Language {
     let chosen = text(headers, COOKIE).and_then(|cookies| {
         let pair = cookies.split(';').find_map(|pair| pair.trim().strip_prefix("regrind_language="))?;

@@ -46,14 +46,15 @@ struct Head {
 }
 
 impl Knowledge {
-    /// Reads from the plant the results that other cells have learned for parts of this `kind`. If there are such
-    /// results, also reads pairs of results of two cells for the same kind; they show how similar the machines are. If
-    /// `simulation` is true, reads only results of simulated cells, otherwise only results of real cells. `artefacts`
-    /// names the folder with the large files.
+    /// Reads from the plant the results that other cells have learned for parts of the kind `kind`. If there is at
+    /// least one such result, also reads pairs of results: two cells that have made the same kind of part, which can be
+    /// another kind than `kind`. The pairs show how similar the machines are. If `simulation` is true, reads only
+    /// results of simulated cells, otherwise only results of real cells. `artefacts` names the folder with the large
+    /// files.
     ///
     /// # Errors
-    /// The plant cannot be reached, or this computer did not sign in as a cell. An invalid result is not an error: its
-    /// reason is added to `left_alone` and reported to the plant.
+    /// The plant cannot be reached, or this computer did not sign in as a cell. An invalid result is not an error: the
+    /// reason is added to `left_alone`, the list of rejected results, and reported to the plant.
     pub async fn query(
         link: &DatabaseLink,
         artefacts: Option<&ArtefactSettings>,
@@ -80,9 +81,9 @@ impl Knowledge {
         Ok(knowledge)
     }
 
-    /// Checks the results in `rows` and returns the valid ones. The flag is true for results of a simulation.
-    /// `artefacts` names the folder with the large files. For each invalid result, reports the reason to the plant and
-    /// adds it to `left_alone`.
+    /// Checks the results of cells in the database rows `rows`, and returns the valid results. `simulation` is true if
+    /// the results must come from simulated runs. `artefacts` names the folder with the large files. Reports the reason
+    /// for each invalid result to the plant, and adds the reason to `left_alone`, the list of rejected results.
     ///
     /// Returns an error if the plant cannot be reached.
     async fn verify_results(
@@ -109,11 +110,12 @@ impl Knowledge {
     }
 }
 
-/// Reads a result of another cell. `row` is the row of the database. If the row has no content, reads the content from
-/// the folder of large files, which `artefacts` names. `simulation` is true if the run of this cell is simulated.
-/// Checks that the content has the hash in `row` and that the result fits the kind of part.
+/// Reads the learned result of a cell from `row`, a row of the database. If the row does not contain the content of the
+/// result file, reads the content from the folder of large files, which `artefacts` names. `simulation` is true if the
+/// run of this cell is simulated. Checks that the content has the SHA-256 hash in `row` and that the result fits the
+/// kind of part in `row`.
 ///
-/// Returns a text with the reason as error if the result cannot be used.
+/// Returns the reason as a text if the result cannot be used.
 fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> Result<DeliveredResult, String> {
     let (kind, is_own): (String, bool) = (row.get(0), row.get(1));
     let from = CellRun { cell: row.get(2), run: row.get(3) };
@@ -144,10 +146,13 @@ fn bounded(path: &Path) -> io::Result<Vec<u8>> {
     }
 }
 
-/// Registers the learned result of a finished run in the plant, so that other cells can use it. `folder` is the folder
-/// of the run. `id` is the id of the run in the plant. All files of the run must have arrived at the plant before.
-/// Returns the reason if the plant refuses the result. Returns `None` if the result is registered, or if the run has no
-/// usable result.
+/// Registers the learned result of a finished run in the plant, so that other cells can use it. The learned result is
+/// the file `learned.json` in the run folder `folder`. `id` is the id of the run in the plant. All files of the run
+/// must have arrived at the plant before.
+///
+/// Returns `Ok(None)` if the result is registered. Also returns `Ok(None)` if the run has no such file, if the file
+/// cannot be read, if its content differs from the record, or if the file does not name its kind of part. Returns
+/// `Ok(Some(reason))` if the plant refuses the result. Returns an error if the plant cannot be reached.
 pub(crate) async fn teach(link: &DatabaseLink, folder: &Path, id: i32) -> Result<Option<String>, PlantError> {
     let failed = refused("the learned error of a run");
     let text = "SELECT a.sha256 FROM run_artefact a WHERE a.run = $1 AND a.name = $2 AND NOT EXISTS (SELECT FROM lesson l WHERE l.run = $1)";

@@ -120,9 +120,10 @@ impl Replicator {
         open
     }
 
-    /// Sends the new records and files of the run `name` to the plant, and adds their numbers to `shipped`. Returns
-    /// true if the plant then has all records and files that the run had at the beginning of the call. Returns false if
-    /// the journal is still empty.
+    /// Sends the new records and files of the run named `name` to the plant. Adds the counts of the sent records and
+    /// files to `shipped`, the result of the current round. Returns true if the plant then has all records and files
+    /// that the run had at the beginning of the call. Returns false if a file cannot be sent, or if the journal is
+    /// still empty.
     ///
     /// Returns an error if the journal cannot be read, if it differs from the plant's copy, or if the plant cannot be
     /// reached.
@@ -161,8 +162,9 @@ impl Replicator {
 
     /// Registers the file `learned.json` of a finished run in the plant, so that other cells can use what this cell has
     /// learned. `folder` is the run folder, `run` the name of the run, and `id` its id in the plant. If the plant
-    /// refuses the file, adds the reason to `shipped`, but only once for each run. Does nothing if the run has no
-    /// usable file of this kind. Returns an error if the plant cannot be reached.
+    /// refuses the file, adds the reason to `shipped`, the result of the current round, but only once for each run.
+    /// Does nothing if the run has no such file, if the file cannot be read, if its content differs from the record, or
+    /// if the file does not name its kind of part. Returns an error if the plant cannot be reached.
     async fn teach(
         &mut self,
         link: &DatabaseLink,
@@ -180,8 +182,11 @@ impl Replicator {
     }
 
     /// Sends the files of a run whose contents the plant does not have. `folder` is the run folder, `run` the name of
-    /// the run, and `id` its id in the plant. Returns two numbers: of the files that were sent, and of the files that
-    /// cannot be sent. Reports each file that cannot be sent to the plant once, and adds the reason to `shipped`.
+    /// the run, and `id` its id in the plant. Returns two counts: first the number of files that were sent, then the
+    /// number of files that cannot be sent.
+    ///
+    /// If a file cannot be sent, reports this to the plant and adds the reason to `shipped`, the result of the current
+    /// round. This is done only once for each file. Returns an error if the plant cannot be reached.
     async fn give_files(
         &mut self,
         link: &DatabaseLink,
@@ -275,11 +280,13 @@ async fn open_run(link: &DatabaseLink, name: &str) -> Result<PlantRunState, Plan
     Ok(PlantRunState { id: row.get(0), records: row.get(1), head: row.get(2) })
 }
 
-/// Checks that the journal of a run at the cell agrees with the plant's copy. `there` is the number of records that the
-/// plant has, and the hash of the last of them. The journal must contain a record of this number with this hash, unless
-/// the plant has no records yet.
+/// Checks that the journal of a run at the cell agrees with the plant's copy. `folder` is the run folder, and `run` is
+/// the name of the run. `there` is the state of the plant's copy: the number of records that the plant has, and the
+/// hash of the last of these records. The journal must contain the record with this number, and this record must have
+/// this hash. If the plant has no records yet, there is no check.
 ///
-/// If it does not, the journal was cut or rewritten. The function then reports this to the plant and returns an error.
+/// If the check fails, the journal was cut or rewritten. The function then reports this to the plant and returns an
+/// error. Also returns an error if the journal cannot be read.
 async fn compare_with_plant(
     link: &DatabaseLink,
     folder: &Path,

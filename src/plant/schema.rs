@@ -21,13 +21,14 @@ const GROUPS: [&str; 4] = ["regrind_cell", "regrind_reader", "regrind_planner", 
 /// Key of the advisory lock that stops two programs from changing the layout at once.
 const LOCK: i64 = 0x5267_7264_506c_616e;
 
-/// Updates the layout of a database (its tables and functions) to the version of this program. The database role must
-/// be the owner of the database. Returns the version of the layout before and after the update; the version is 0 for a
-/// new database.
+/// Updates the layout of a database (its tables and functions) to the version of this program. Executes each migration
+/// (update script) that the database does not have yet. The database role must be the owner of the database. Returns
+/// the version of the layout before the update, then the version after the update. The version of a new database is 0.
 ///
 /// # Errors
-/// Fails if the database role has no right to change the layout, if a later version of Regrind made the layout, if the
-/// recorded hash of a migration differs from this program's, or if the database cannot be reached.
+/// Fails if the database role has no right to change the layout, or if a later version of Regrind made the layout.
+/// Fails if a migration that the database has executed has another SHA-256 than the same migration of this program.
+/// Fails if the database cannot be reached.
 pub async fn migrate(link: &mut DatabaseLink) -> Result<[i32; 2], PlantError> {
     let failed = refused("its layout");
     let client = link.client_mut();
@@ -66,8 +67,9 @@ pub async fn migrate(link: &mut DatabaseLink) -> Result<[i32; 2], PlantError> {
 /// Checks that the layout of a database (its tables and functions) is the one that this program uses.
 ///
 /// # Errors
-/// Fails if the version of the layout is older or later than that of this program, if the hash of a migration differs,
-/// or if the database cannot be reached.
+/// Fails if the version of the layout is older or later than that of this program. Fails if a migration (update script)
+/// that the database has executed has another SHA-256 than the same migration of this program. Fails if the database
+/// cannot be reached.
 pub async fn check_layout(client: &Client) -> Result<(), PlantError> {
     let layout = |found, remedy| PlantError::Layout { found, known: known(), remedy };
     let older = "update it as its owner: regrind plant init";
@@ -90,12 +92,13 @@ fn known() -> i32 {
     MIGRATIONS.last().map_or(0, |(version, _)| *version)
 }
 
-/// Compares the migrations (update scripts) of a database with those of this program. `applied` contains the version
-/// and the SHA-256 of each migration that the database has, in ascending order of version. Returns the newest applied
-/// version, or 0 if there is none.
+/// Compares the migrations (update scripts) that a database has executed with those of this program. `applied` contains
+/// the version and the SHA-256 of each executed migration, in ascending order of version. Returns the version of the
+/// last executed migration, or 0 if `applied` is empty. A database that lacks the newest migrations is not an error.
 ///
 /// # Errors
-/// Fails if the database has a migration that this program does not have, or a migration with another version or text.
+/// Fails if the database has more migrations than this program. Fails if a migration in `applied` has another version
+/// or another SHA-256 than the migration of this program at the same position.
 fn compare_migrations(applied: &[(i32, String)]) -> Result<i32, PlantError> {
     for (k, (version, sha256)) in applied.iter().enumerate() {
         match MIGRATIONS.get(k) {
@@ -165,8 +168,8 @@ pub async fn enrol_cell(
     step.commit().await.map_err(&failed)
 }
 
-/// Creates the database role `role` for a person or a program, or gives an existing role a new `password`. `of` is the
-/// purpose of the role, which determines its rights.
+/// Creates the database role `role` for a person or a program, with the password `password`. `of` is the purpose of the
+/// role; it determines the rights. If the role exists already, sets its password and adds the rights.
 ///
 /// # Errors
 /// Fails if the database role of the caller has no right to create roles, or if the database cannot be reached.

@@ -141,9 +141,10 @@ fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSou
     None
 }
 
-/// Removes the name of a key from the beginning of an error message, such as "`radius_mm` must be positive". The rest
-/// can then follow the full name of the key, such as `nominal.surface.radius_mm`. `key` is the name without backticks.
-/// If `sentence` does not begin with this key in backticks, returns "is refused: " and the whole sentence.
+/// Returns the error message `sentence` without the name of the key at its beginning. `key` is this name, without
+/// backticks. For example, the message "`radius_mm` must be positive" becomes "must be positive". The caller can then
+/// put the full name of the key, such as `nominal.surface.radius_mm`, before the result. If `sentence` does not begin
+/// with this key in backticks, returns "is refused: " and the whole sentence.
 fn without_key(key: &str, sentence: &str) -> String {
     match sentence.strip_prefix(&format!("`{key}` ")) {
         Some(rest) => rest.to_owned(),

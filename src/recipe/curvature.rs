@@ -5,13 +5,13 @@ use crate::surface::DefinedSurface;
 /// Number of evaluated positions along each axis of the aperture's box.
 const POSITIONS_PER_AXIS: usize = 61;
 
-/// Returns the smallest concave radius of the surface in mm, and its position (x, y) in mm. The first entry is for the
-/// side of the surface towards +z, the second for the side towards -z. The radius is infinite if the surface is not
-/// concave on this side.
+/// Returns the smallest concave radius of the surface in mm, and the position (x, y) in mm at which the surface has
+/// this radius. The result has two entries: first for the side of the surface towards +z, then for the side towards -z.
+/// If the surface is not concave on a side, the radius of this entry is infinite and the position is (0, 0).
 ///
 /// Computes the curvature on a grid within the aperture, from finite differences of the exact gradient. The radius is
-/// accurate to a few percent, which is sufficient to check a recipe. The registration checks the offset surface (the
-/// surface on which the probe centres are) itself.
+/// accurate to a few percent, which is sufficient to check a recipe. The registration itself checks the offset surface
+/// (the surface on which the probe centres are).
 pub(super) fn min_concave_radii_mm(surface: &DefinedSurface) -> [(f64, [f64; 2]); 2] {
     let [[x0, y0], [x1, y1]] = surface.aperture().bounds();
     let at = |least: f64, most: f64, k: usize| least + (most - least) * k as f64 / (POSITIONS_PER_AXIS - 1) as f64;

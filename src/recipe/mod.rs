@@ -190,9 +190,9 @@ impl Recipe {
         })
     }
 
-    /// Returns an error that reports a problem with the value of the recipe key `key`. The error contains the position
-    /// of this key in the recipe file. Other modules use this for problems that they find themselves. `found` describes
-    /// the value, `allowed` the permitted values, and `remedy` the action that solves the problem.
+    /// Returns an error for the recipe key `key`. The error contains the position of this key in the recipe file.
+    /// `found` describes the value of the key, `allowed` the permitted values, and `remedy` the action that solves the
+    /// problem. Other modules call this function when they find a problem with a value of the recipe.
     pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
         problem_at(&self.path, &self.text, RENAMED, key, [found, allowed, remedy])
     }

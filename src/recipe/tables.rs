@@ -504,8 +504,11 @@ pub enum WheelDimensions {
 }
 
 impl WheelDimensions {
-    /// Returns the radius of the wheel in mm: for a torus up to the outermost point of the rim, for a cup up to the
-    /// middle of its face.
+    /// Returns the radius of the wheel in mm. The meaning depends on the shape of the wheel:
+    ///
+    /// - sphere: the radius of the ball
+    /// - torus (a disc with a round rim): from the axis of the wheel to the outermost point of the rim
+    /// - cup (a ring that grinds with its face): from the axis of the wheel to the middle of the face
     pub fn radius_mm(&self) -> f64 {
         match *self {
             Self::Sphere { radius_mm } | Self::Torus { radius_mm, .. } | Self::Cup { radius_mm, .. } => radius_mm,

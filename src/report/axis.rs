@@ -38,8 +38,10 @@ impl Ruler {
         Self { scale, range, pixels }
     }
 
-    /// Returns the same mapping with a wider range that begins and ends at a tick. `most` is the intended maximum
-    /// number of ticks on a linear axis. On a logarithmic axis the range begins and ends at a power of ten.
+    /// Returns the same mapping with a range that is extended, where necessary, so that it begins and ends at a tick.
+    /// On a linear axis, `most` is the maximum number of intervals between ticks in the old range; the extended range
+    /// can have one interval more. On a logarithmic axis, the new range begins and ends at a power of ten, and `most`
+    /// is not used.
     pub(super) fn rounded(self, most: usize) -> Self {
         let [low, high] = self.range;
         let step = match self.scale {
@@ -100,8 +102,9 @@ fn round_numbers(low: f64, high: f64, step: f64) -> impl Iterator<Item = f64> {
     (first..=last).map(move |k| k as f64 * step)
 }
 
-/// Formats `value`, a multiple of the tick distance `step`, with as many decimals as `step` needs. Very small and very
-/// large steps get an exponent.
+/// Returns the label of the tick at `value`. `step` is the distance between ticks, and `value` is a multiple of `step`.
+/// The label has as many decimals as `step` needs. If `step` is below 1e-4, or is 1e6 or more, the label has one digit
+/// and an exponent, such as "2e−7". The label of 0 is always "0".
 fn label(value: f64, step: f64) -> String {
     if value == 0.0 {
         return "0".into();

@@ -123,9 +123,10 @@ fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
     html + "</table>\n"
 }
 
-/// Returns an HTML list with the tolerance indications by ISO 10110-5 for each cycle: the one that the form of the part
-/// meets with a probability of 97.5 %, and the one that the measured points just meet. Omits the first for files that
-/// do not contain it. `cycles` contains the number and the figures of each cycle.
+/// Returns an HTML list with the tolerance indications of ISO 10110-5 (texts such as "3/A(B/C)") for each cycle. Each
+/// entry contains two indications. The form of the part meets the first one with a probability of 97.5 %. The measured
+/// points just meet the second one. The first one is omitted if the figures do not contain it. `cycles` contains the
+/// number of each cycle and its figures (the content of `figures.json`).
 fn notations(cycles: &[(u32, Value)]) -> String {
     let mut html = "<p>The descriptions of the figures are those of the last cycle. All figures are along the outward normal, positive where material is proud; \
                     they are figures of the surface, not of a wavefront. Indication of ISO 10110-5, in nanometres, that the form meets in each value with \

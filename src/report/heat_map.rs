@@ -67,12 +67,14 @@ impl HeatMap {
         Ok(map.with_colours(ColourMap::Diverging))
     }
 
-    /// Creates a heat map of lengths. The map shows micrometres, or nanometres if the peak to valley is below 0.1 µm.
+    /// Creates a heat map of lengths. `title` is the title of the figure, and `quantity` is the name of the length on
+    /// the colour bar. The map shows micrometres, or nanometres if the peak to valley is below 0.1 µm.
     ///
     /// Shapes: two or more samples (x, y, length) in any order. Units: millimetres.
     ///
     /// # Errors
-    /// Fails as [`HeatMap::new`] does.
+    /// Fails if there are fewer than two samples, if a number is not finite, or if all samples have the same position
+    /// (x, y).
     pub fn of_lengths(title: &str, quantity: &str, samples_mm: &[[f64; 3]]) -> Result<Self, ReportError> {
         let [low, high] = range(samples_mm.iter().map(|s| s[2]));
         let (per_mm, unit) = if high - low < 1e-4 { (1e6, "nm") } else { (1e3, "µm") };
@@ -80,24 +82,26 @@ impl HeatMap {
         Ok(Self { per_mm, ..Self::new(title, quantity, unit, &samples)? })
     }
 
-    /// Creates a heat map of the deviations of measured points from the nominal surface, after a registration. Each
-    /// deviation is drawn at the x and y of its contact point. Omits outliers and other points that are not inliers.
+    /// Creates a heat map of the deviations of measured points from the nominal surface, after a registration. `title`
+    /// is the title of the figure. Each deviation is drawn at the x and y of its contact point. Only inliers are drawn.
     /// Red is above the nominal surface, blue is below it. The map shows micrometres, or nanometres if the peak to
     /// valley is below 0.1 µm.
     ///
     /// Frame: model.
     ///
     /// # Errors
-    /// Fails as [`HeatMap::new`] does.
+    /// Fails if there are fewer than two inliers, if a number is not finite, or if all inliers have the same position
+    /// (x, y).
     pub fn of_deviations(title: &str, deviations: &[Deviation]) -> Result<Self, ReportError> {
         let used = deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         let samples: Vec<[f64; 3]> = used.map(|d| [d.point.x, d.point.y, d.deviation_mm]).collect();
         Self::of_lengths(title, "deviation", &samples)
     }
 
-    /// Sets the colour map and its range. For [`ColourMap::Diverging`], the range is symmetric about zero. For
-    /// [`ColourMap::Sequential`], it goes from the minimum to the maximum of the map. Removes a tolerance that was set
-    /// before.
+    /// Sets the colours of the heat map, and computes the range of values that the colours show. For
+    /// [`ColourMap::Diverging`], the range is symmetric about zero and ends at the largest absolute value of the
+    /// pixels. For [`ColourMap::Sequential`], the range goes from the smallest to the largest value of the pixels. If
+    /// the range would have no width, it is extended by 1 at both ends. Removes a tolerance that was set before.
     pub fn with_colours(self, colours: ColourMap) -> Self {
         let [low, high] = range(self.raster.values.iter().copied());
         let range = match colours {
@@ -110,8 +114,8 @@ impl HeatMap {
     }
 
     /// Sets a tolerance. Values from `-tolerance` to `tolerance` get only a tint (a very light colour), and the colour
-    /// bar marks this band. Always uses the diverging colour map with a range that is symmetric about zero. If the
-    /// range of the colours ends less than 25 % beyond the tolerance, extends the range.
+    /// bar marks this band. Always uses the diverging colour map, with a range of values that is symmetric about zero.
+    /// The range ends at 1.25 times the tolerance or more. A smaller range is extended to this limit.
     ///
     /// Units: millimetres for a map of lengths, otherwise the unit of the map.
     ///
@@ -158,9 +162,9 @@ impl HeatMap {
         Self { max_size: largest, ..self }
     }
 
-    /// Makes the pixels outside `aperture` transparent, also pixels that were filled in between samples. A pixel whose
-    /// centre is outside by at most half of its diagonal remains visible, because a sample on the rim fills such a
-    /// pixel.
+    /// Makes the pixels outside `aperture` transparent. This includes pixels without a sample that were filled from
+    /// neighbouring pixels. A pixel remains visible if the distance from its centre to the aperture is at most half the
+    /// diagonal of a pixel, because such a pixel can contain a sample on the rim.
     ///
     /// Units: millimetres. Frame: that of the samples.
     pub fn within(mut self, aperture: &Aperture) -> Self {
@@ -326,7 +330,8 @@ impl HeatMap {
         known().filter(|v| v.abs() <= band).count() as f64 / known().count().max(1) as f64
     }
 
-    /// Saves the complete figure ([`Self::to_svg`]).
+    /// Saves the complete figure as an SVG file at `path`: the map within axes, a colour bar, the title, and lines of
+    /// text with PV and RMS.
     ///
     /// # Errors
     /// Fails if the pixels cannot be encoded or if the file cannot be written.
@@ -334,7 +339,7 @@ impl HeatMap {
         Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
     }
 
-    /// Saves the map alone, without axes and text ([`Self::to_png`]).
+    /// Saves the map alone, without axes and text, as a PNG file at `path`. Pixels without a value are transparent.
     ///
     /// # Errors
     /// Fails if the pixels cannot be encoded or if the file cannot be written.
@@ -387,8 +392,9 @@ const LINE: f64 = 18.0;
 /// Average width of a letter in those lines. It is also sufficient if a wider typeface replaces the intended one.
 const LETTER: f64 = 6.8;
 
-/// Breaks `line` into lines of at most `most` characters. Breaks after the last comma that fits, or else at the last
-/// space that fits. If neither fits, the rest of the text stays in one line, which is then longer than `most`.
+/// Breaks `line` into several lines of at most `most` characters. Each break is after the last comma that is followed
+/// by a space within the first `most` characters. Without such a comma, the break is at the last space within these
+/// characters. Without such a space, the rest of the text becomes one line that is longer than `most`.
 fn broken(line: &str, most: usize) -> Vec<String> {
     let (mut lines, mut rest) = (Vec::new(), line);
     while let Some((end, _)) = rest.char_indices().nth(most) {

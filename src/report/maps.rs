@@ -35,11 +35,12 @@ impl CycleMap {
 
     /// Returns an HTML figure with the coloured map of this cycle and a caption below the map. The colour scale runs
     /// from `-limit_um` to `limit_um`, in micrometres. `largest` is the maximum width and height of the map in pixels.
-    /// The caption is the number of the cycle, followed by `caption`. If the map cannot be drawn, the figure contains
-    /// the reason as text.
+    /// The caption is the number of the cycle, followed by `caption`. If the map cannot be drawn, for example because
+    /// it has fewer than two nodes, the figure contains the reason instead of the map.
     ///
     /// # Errors
-    /// Fails if the drawing returns a file error.
+    /// Fails only if the drawing returns [`ReportError::File`]. For every other error of the drawing, the function
+    /// returns the figure with the reason.
     fn figure(&self, limit_um: f64, largest: [f64; 2], caption: &str) -> Result<String, ReportError> {
         let width = largest[0] + BESIDE;
         let svg = HeatMap::new(&shortened(&self.title, width, 8.5), "deviation", "\u{b5}m", &self.samples_um)

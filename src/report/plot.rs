@@ -75,10 +75,11 @@ impl Plot {
         Ok(svg.finish())
     }
 
-    /// Saves the plot as SVG.
+    /// Saves the plot as an SVG file at `path`.
     ///
     /// # Errors
-    /// Fails as [`Plot::to_svg`] does, or if the file cannot be written.
+    /// Fails if there are no points, if a number is not finite, if a number on a logarithmic axis is not above 0, or if
+    /// the file cannot be written.
     pub fn save_svg(&self, path: &Path) -> Result<(), ReportError> {
         Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
     }

@@ -57,11 +57,15 @@ pub fn coloured_ply(
     Ok(bytes)
 }
 
-/// Writes points with their colours and deviations as a binary PLY file to `path`. The other parameters are those of
-/// [`coloured_ply`], which makes the content of the file.
+/// Writes a binary PLY file to `path` with points, their colours and their deviations, and the triangles between the
+/// points. `rows_mm` has x, y, z and the deviation of each point in millimetres. Each triangle has three indices into
+/// `rows_mm`, counted from 0. `title` and each of the `remarks` become a comment. With a `tolerance_mm`, points with a
+/// deviation from `-tolerance_mm` to `tolerance_mm` get only pale colours. [`coloured_ply`] returns the same content
+/// without a file.
 ///
 /// # Errors
-/// Fails as [`coloured_ply`] does, or if the file cannot be written.
+/// Fails if there is no point, if a number is not finite, if the tolerance is not finite and above 0, if a triangle
+/// refers to a point that does not exist, or if the file cannot be written.
 pub fn save_coloured_ply(
     path: &Path,
     title: &str,

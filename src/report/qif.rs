@@ -127,9 +127,10 @@ fn attributes(xml: &mut Xml, list: &[(&str, &str)]) {
     });
 }
 
-/// Writes the QIF element `Characteristics`. Each figure of the results (such as PV or RMS) gets three child elements:
-/// its definition with name and limit, its nominal, and its item. For the figure with the index k, counted from 0, the
-/// definition has the identifier n = `FIRST_FIGURE + 3 k`, the nominal n + 1, and the item n + 2.
+/// Writes the QIF element `Characteristics`. For each figure of the results, such as PV or RMS, `Characteristics`
+/// contains three elements: a definition with the name and the limit, a nominal (the link to the definition), and an
+/// item (the link to the nominal). The elements have consecutive identifiers. For the figure with the index k, counted
+/// from 0, the definition has the identifier n = `FIRST_FIGURE + 3 k`, the nominal n + 1, and the item n + 2.
 fn characteristics(xml: &mut Xml, results: &Results) {
     let kinds: Vec<_> = (FIRST_FIGURE..).step_by(3).zip(results.kinds()).collect();
     let n = kinds.len().to_string();

@@ -159,20 +159,21 @@ impl Results {
         }
     }
 
-    /// Returns the name, the meaning and the limit of each figure that the file of results lists. The list is that of
-    /// the measurement with the most figures, in the order of that measurement. Returns nothing if there is no
-    /// measurement.
+    /// Returns the kinds of the figures (name, meaning and limit of each) that the file of results lists. These are the
+    /// figures of the measurement that has the most figures, in the order of that measurement. The iterator is empty if
+    /// there is no measurement.
     pub(super) fn kinds(&self) -> impl Iterator<Item = &Kind> {
         let most = self.measured.iter().max_by_key(|of| of.figures.len());
         most.into_iter().flat_map(|of| &of.figures).map(|figure| &figure.kind)
     }
 
-    /// Adds the figures of ISO 10110-5 to the last usable measurement of each cycle. They are read from the file
-    /// `figures.json` of the cycle in the run folder `folder`. Nothing is added for a cycle without this file, or if
-    /// one of the six figures is missing in it.
+    /// Adds the six figures of ISO 10110-5 (A, B, C, RMSt, RMSi and RMSa) to the last measurement of each cycle that
+    /// has figures. Reads the six figures from the file `figures.json` of the cycle. `folder` is the run folder, and
+    /// `story` is the history of the run, which contains the file names. Adds nothing to a cycle without this file, or
+    /// if the file does not contain all six figures.
     ///
     /// # Errors
-    /// Fails if a `figures.json` on record cannot be read.
+    /// Fails if a file `figures.json` that the history names cannot be read or is not JSON.
     fn with_areas(mut self, story: &RunHistory, folder: &Path) -> Result<Self, ReportError> {
         for (cycle, of) in &story.cycles {
             let Some(name) = &of.form else { continue };
@@ -223,12 +224,15 @@ fn decision_rule(tolerance: &Tolerance) -> String {
 
 /// Returns the figures of a measurement for the file of results.
 ///
-/// With a `tolerance`, the judged figures come first, with their limits. After them comes the peak to valley (PV) of
-/// the measured points, without a limit and for information only. It is omitted if the judged PV already is that of all
-/// measured points. Without a `tolerance`, returns the PV and the RMS of the measured points, without limits.
+/// With a `tolerance`, the list begins with the PV and the RMS that the decision rule compares with the limits. Each of
+/// these two figures has its limit, if the tolerance contains one. Then follows the peak to valley (PV) of the measured
+/// points, without a limit and for information only. This last figure is omitted if the first PV already is the PV of
+/// all measured points.
 ///
-/// `judged` is true if the cell judged the measurement. If it is false, the status of each figure is
-/// [`LimitStatus::NotJudged`]. A figure without a limit has the same status.
+/// Without a `tolerance`, the list contains the PV and the RMS of the measured points, without limits.
+///
+/// `judged` is true if the cell judged the measurement. If `judged` is false, the status of each figure is
+/// [`LimitStatus::NotJudged`]. A figure without a limit always has this status.
 fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) -> Vec<Figure> {
     let compared = tolerance.map(|tolerance| tolerance.compare(figures));
     // The form is judged. The figure of the points, which contains the noise of the probe, is added for information.
@@ -311,9 +315,10 @@ const AREAS: [(&str, &str, &str); 6] = [
     ),
 ];
 
-/// Returns the six figures of ISO 10110-5 in millimetres, each with its expanded uncertainty and without a limit.
-/// `told` is the JSON content of `figures.json`, which gives the figures in nanometres. The expanded uncertainty is
-/// half the width of the interval in the file. Returns `None` if one of the figures is missing.
+/// Returns the six figures of ISO 10110-5 (A, B, C, RMSt, RMSi and RMSa) in millimetres, each with its expanded
+/// uncertainty and without a limit. `told` is the JSON content of `figures.json`, which gives each figure in nanometres
+/// with its median and its 95 % credible interval. The expanded uncertainty is half the width of this interval. Returns
+/// `None` if one of the six figures, or one of its numbers, is missing.
 fn areas(told: &serde_json::Value) -> Option<Vec<Figure>> {
     const MM_OF_NM: f64 = 1e-6;
     let rows = told["form"].as_array()?;

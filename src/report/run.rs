@@ -280,11 +280,16 @@ fn cycles(story: &RunHistory) -> String {
             (k = 2). The level is the height of the target surface above the nominal surface.</p>\n"
 }
 
-/// Returns the HTML table of the estimated machine parameters, such as the radius error of the wheel, for each cycle. A
-/// row shows the estimated deviation with its expanded uncertainty (k = 2), the compensated part of it, the correction
-/// of the next pass, and the reduction of the rms error in micrometres. Below the table is the rms of the residual
-/// error of each cycle, which the correction map must correct. Returns an empty text if the record contains no
-/// parameters.
+/// Returns the HTML table of the estimated errors of machine parameters, such as the error of the wheel radius. Each
+/// row is for one parameter in one cycle. A row shows these values:
+///
+/// - the estimated error with its expanded uncertainty (k = 2);
+/// - the part of the error that is compensated;
+/// - the total correction of the parameter for the next pass;
+/// - the reduction of the rms error of the part by this compensation, in micrometres.
+///
+/// Below the table is a line for each cycle with the rms of the error that remains for the correction map. Returns an
+/// empty text if the record contains no parameters.
 fn parameters(story: &RunHistory) -> String {
     let row = |number: u32, of: &RecordedParameter| {
         let RecordedParameter { name, unit, off, expanded, taken, told, removes_rms_um } = of;
@@ -330,9 +335,10 @@ fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, lev
 }
 
 /// Returns the HTML table cells for the figures `f` of a measurement: PV and RMS with their expanded uncertainties in
-/// micrometres, the number of points, the number of outliers, the coverage in percent, and `level`. With a `tolerance`,
-/// PV and RMS are the judged figures. Without a `tolerance`, they are those of all measured points. `level` is the
-/// complete text of the last cell.
+/// micrometres, the number of points, the number of outliers, the coverage in percent, and `level`. `level` is the text
+/// of the last cell: the height of the target surface above the nominal surface in micrometres, or "-". With a
+/// `tolerance`, PV and RMS are the figures that are compared with the limits. Without a `tolerance`, PV and RMS are
+/// those of all measured points.
 fn figures_row(f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> String {
     // Each record contains the tolerance of the run; if the run ended before that, the figures of the points are shown.
     let points = || [[f.pv_mm, f.pv_expanded_mm], [f.rms_mm, f.rms_expanded_mm]];

@@ -91,8 +91,9 @@ pub(super) struct Measurement {
 }
 
 impl Measurement {
-    /// Returns true if this measurement is not complete, because its figures request further touches of the probe.
-    /// These touches belong to the same measurement. Returns false if the measurement has no figures.
+    /// Returns true if this measurement is not complete: its last evaluation requested that the probe touches further
+    /// points. The further points become part of the same measurement. Returns false if the measurement has no figures
+    /// yet.
     fn expects_more_touches(&self) -> bool {
         self.figures.as_ref().is_some_and(|figures| figures.touch_on.is_some())
     }

@@ -290,9 +290,9 @@ fn colour_of(events: &BTreeSet<String>) -> &'static str {
     }
 }
 
-/// Returns the label of an arrow between two states: the names of at most two of its `events`. If there are more
-/// events, their number follows, such as "start, resume +3". Orders of a person come first, then the events of normal
-/// operation, then faults.
+/// Returns the label of an arrow between two states: the names of the first two of its `events`. If there are more than
+/// two events, the number of the other events follows. For example, "start, resume +3" is the label for five events.
+/// Orders of a person come first, then the events of normal operation, then faults.
 fn label_of(events: &BTreeSet<String>) -> String {
     let rank = |event: &&String| {
         let known = |names: &[&str]| names.contains(&event.as_str());
@@ -335,7 +335,8 @@ fn border(node: &Node, to: [f64; 2]) -> [f64; 2] {
     [node.middle[0] + share * dx, node.middle[1] + share * dy]
 }
 
-/// Returns the point of a quadratic Bézier curve at the parameter `t`.
+/// Returns the point of a quadratic Bézier curve at the parameter `t`, from 0 at the start to 1 at the end. `[a, b, c]`
+/// are the start, the control point and the end of the curve.
 fn on([a, b, c]: &[[f64; 2]; 3], t: f64) -> [f64; 2] {
     let weights = [(1.0 - t) * (1.0 - t), 2.0 * t * (1.0 - t), t * t];
     std::array::from_fn(|k| weights[0] * a[k] + weights[1] * b[k] + weights[2] * c[k])

@@ -202,8 +202,9 @@ impl Svg {
         ));
     }
 
-    /// Defines a vertical colour gradient that shapes can use as the fill `url(#id)`. `stops` are pairs of a position,
-    /// from 0 at the bottom to 1 at the top, and the colour there.
+    /// Defines a vertical colour gradient with the identifier `id`. Shapes can use the gradient as the fill `url(#id)`.
+    /// `stops` are pairs of a position and the colour (red, green, blue) at this position. Position 0 is the bottom,
+    /// and 1 is the top.
     pub(super) fn gradient(&mut self, id: &str, stops: &[(f64, [u8; 3])]) {
         self.put(format_args!("<defs><linearGradient id=\"{id}\" x1=\"0\" y1=\"1\" x2=\"0\" y2=\"0\">"));
         for (offset, [r, g, b]) in stops {

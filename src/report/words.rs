@@ -72,9 +72,9 @@ fn seal_words(value: &Value) -> Option<String> {
     ))
 }
 
-/// Returns in one line a person's confirmation of the state of a machine: the machine, the confirmed state, and the
-/// names of the map and the file if they are given. `value` is the content of the record. Returns `None` if it contains
-/// no state.
+/// Returns one line about a record in which a person confirmed the state of a machine. The line contains the machine
+/// and the confirmed state. The names of the map and of the file follow if the record contains them. `value` is the
+/// content of the record. Returns `None` if `value` contains no confirmed state.
 fn person_words(device: Device, value: &Value) -> Option<String> {
     let mut line = format!("{device}: {}", value["confirmed"].as_str()?);
     for key in ["map", "file"] {
@@ -90,14 +90,16 @@ fn step_words(device: Device, value: &Value) -> Option<String> {
     Some(format!("{device}: order {step} to recover the machine; state before the order: {seen}"))
 }
 
-/// Returns in words which machines are home. `home` holds true for a machine that is home: first the CMM, then the
-/// grinder.
+/// Returns a text that says for each machine if it is home, such as "CMM home, grinder not home". A machine is home if
+/// a recovery brought it back to the idle state. `home` has one value for the CMM and one for the grinder, in this
+/// order.
 pub(super) fn home_words(home: [bool; 2]) -> String {
     let of = |(device, home): (Device, bool)| format!("{device} {}", if home { "home" } else { "not home" });
     Device::BOTH.into_iter().zip(home).map(of).collect::<Vec<_>>().join(", ")
 }
 
-/// Formats the share of the part, from 0 to 1, over which the wheel passes without contact, such as "1.5 % in air".
+/// Formats the share of the part over which the wheel passes without contact, such as "1.5 % in air". `share` is from 0
+/// to 1. The text is "none in air" if `share` is 0, and "< 0.1 % in air" if `share` is smaller than 0.001.
 pub fn in_air(share: f64) -> String {
     match 100.0 * share {
         0.0 => "none in air".to_owned(),
@@ -107,8 +109,9 @@ pub fn in_air(share: f64) -> String {
 }
 
 /// Returns one line with the values that the grinder reported about a pass, such as path length and removed volume.
-/// `value` is the content of the record. Values that are not in `value` are omitted. If there are none, the line says
-/// so. The result is never `None`.
+/// `value` is the content of the record. The line omits each value that the record does not contain. If the record
+/// contains none of the values, the line is "pass: no details reported". The result is always `Some`. It is an `Option`
+/// only because the functions for other records return one.
 fn pass_words(value: &Value) -> Option<String> {
     let number = |key: &str| value[key].as_f64();
     let told = [
@@ -155,7 +158,7 @@ pub fn ending_words(ending: &Ending) -> String {
     }
 }
 
-/// Converts a name of the program into lower-case words: both `load_confirmed` and `LoadConfirmed` become "load
+/// Converts an identifier from the code into lower-case words. Both `load_confirmed` and `LoadConfirmed` become "load
 /// confirmed".
 fn spaced(name: &str) -> String {
     let mut words = String::new();

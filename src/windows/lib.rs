@@ -25,10 +25,10 @@ use std::ffi::OsStr;
 use std::io;
 use std::os::windows::ffi::OsStrExt;
 
-/// Returns a text in the form that Windows expects: UTF-16 with a zero at its end.
+/// Returns `text` in the form that Windows functions expect: UTF-16 code units with a zero at the end.
 ///
 /// # Errors
-/// A text that contains a zero itself.
+/// Returns an error if `text` itself contains a zero character, because Windows would end the text at this character.
 fn wide(text: &OsStr) -> io::Result<Vec<u16>> {
     let mut units: Vec<u16> = text.encode_wide().collect();
     if units.contains(&0) {

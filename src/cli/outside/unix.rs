@@ -50,9 +50,12 @@ pub(crate) fn forget_what_was_typed() -> io::Result<()> {
     Ok(rustix::termios::tcflush(io::stdin(), rustix::termios::QueueSelector::IFlush)?)
 }
 
-/// Waits for Enter at the terminal, at most for the time `patience`, which must be below 1 s. Returns `Some(true)`
-/// after Enter, and `Some(false)` at the end of the input. Returns `None` if nothing was typed in this time. Also
-/// returns `None` if `has_terminal`, which is called after the input has arrived, returns false.
+/// Waits until a person presses Enter at the terminal, but at most for the time `patience`. `patience` must be below 1
+/// s. Returns `Some(true)` after Enter. Returns `Some(false)` if the input has ended or cannot be read.
+///
+/// Returns `None` if nothing was typed in this time. When input has arrived, calls `has_terminal` before reading.
+/// `has_terminal` must return true if this program may read from the terminal. If it returns false, reads nothing and
+/// returns `None`.
 pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) -> Option<bool> {
     let mut terminal = [PollFd::from_borrowed_fd(rustix::stdio::stdin(), PollFlags::IN)];
     let patience = Timespec { tv_sec: 0, tv_nsec: i64::from(patience.subsec_nanos()) };

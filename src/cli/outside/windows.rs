@@ -54,9 +54,11 @@ pub(crate) fn forget_what_was_typed() -> io::Result<()> {
     Ok(())
 }
 
-/// Waits for a key at the terminal, at most for the time `patience`. Returns `Some(true)` if the key is Enter. Returns
-/// `None` if no key or another key was pressed. Also returns `None` if `has_terminal`, which is called after a key was
-/// pressed, returns false.
+/// Waits until a key is pressed at the terminal, but at most for the time `patience`. Returns `Some(true)` if the key
+/// is Enter. Returns `None` if no key or another key was pressed.
+///
+/// When a key was pressed, calls `has_terminal` before reading the key. `has_terminal` must return true if this program
+/// may read from the terminal. If it returns false, reads nothing and returns `None`.
 pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) -> Option<bool> {
     if !event::poll(patience).is_ok_and(|typed| typed && has_terminal()) {
         return None;

@@ -18,11 +18,17 @@ pub(in super::super) struct Copy {
     pub(in super::super) told: Value,
 }
 
-/// Fetches the copy of a run from the database of the plant, and verifies this copy with `keys`. `plant` is the path of
-/// the plant file. `run` is the folder or the name of the run; `None` means the newest run in `runs`. If the run folder
-/// exists on this computer, also checks that the local journal still contains the records of the copy. Prints the
-/// result, as JSON if `json` is true. With `json` and a local run folder, prints nothing, because the caller prints the
-/// returned result.
+/// Fetches the copy of a run from the database of the plant, and verifies this copy. `keys` are the public keys for the
+/// signatures of the copy. `plant` is the path of the plant file. `run` is the folder or the name of the run. If `run`
+/// is `None`, uses the newest run in the folder `runs`. If the run folder exists on this computer, also checks that the
+/// local journal still contains the records of the copy.
+///
+/// Returns the result, and prints it in two cases:
+///
+/// - If `json` is false, prints the result as text.
+/// - If `json` is true and the run folder does not exist on this computer, prints the result as JSON.
+///
+/// In the remaining case the caller prints the result.
 ///
 /// # Errors
 /// The plant cannot be reached or does not have the run, the copy is not valid, or the local journal differs from the

@@ -60,10 +60,12 @@ pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<Pla
     Ok(PlantKnowledge { learned: task.learned_from_others(&knowledge.results, &alike), words })
 }
 
-/// Estimates how similar the machines of the cells are. The estimate uses the assumed difference `machines_differ` of
-/// the plant file, if one is given. This difference is the share (rms) of the recurring error that is specific to each
-/// machine, for example 0.1. The estimate also compares the results of each pair of cells in `knowledge` that ground
-/// the same kind of part.
+/// Estimates how similar the machines of the cells are. The measure is the share of the repeatable error that only one
+/// machine has. The result collects this share from two sources:
+///
+/// - For each pair of cells in `knowledge` that ground the same kind of part, compares the results of these two cells.
+/// - `machines_differ` is an assumption that the plant file can state; `None` means not stated. The value (0 to 1) is
+///   the rms of the repeatable error that only one machine has, divided by the rms of its whole repeatable error.
 fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> MachineSimilarity {
     let mut alike = MachineSimilarity::default();
     if let Some(share) = machines_differ {

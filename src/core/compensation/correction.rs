@@ -29,37 +29,45 @@ pub struct Correction {
 
 impl Correction {
     /// Returns the correction for the first pass of a part: pass number 1, the value 0 at every node of `grid`, and no
-    /// parameter corrections. `level_mm` is the height of the target surface above the nominal surface, in millimetres.
+    /// corrections of machine parameters (wheel radius, wheel setting, part tilt). `level_mm` is the height of the
+    /// target surface above the nominal surface, in millimetres.
     pub fn zero(grid: Grid, level_mm: f64) -> Self {
         Self { grid, values_mm: vec![0.0; grid.len()], cycle: 1, level_mm, set: None }
     }
 
-    /// Returns true if `values_mm` is 0 at every node and `set` is `None`.
+    /// Returns true if this correction changes nothing: `values_mm` is 0 at every node, and there are no corrections of
+    /// machine parameters (`set` is `None`).
     pub fn is_zero(&self) -> bool {
         self.set.is_none() && self.values_mm.iter().all(|value| *value == 0.0)
     }
 
-    /// Returns the part of this correction that a measurement shows after registration, at every node, in millimetres.
-    /// This is `values_mm` plus the visible part of the parameter corrections ([`ParameterCorrections::seen_mm`]).
+    /// Returns the visible part of this correction at every node, in millimetres. Visible is the part that a
+    /// measurement still shows after registration. This is `values_mm` plus the visible part of the corrections of the
+    /// machine parameters ([`ParameterCorrections::seen_mm`]). Without such corrections, returns `values_mm`.
     ///
-    /// The other part of the parameter corrections has the same effect as a motion of the part. Registration removes
-    /// this effect from the measurement.
+    /// The machine parameters are the wheel radius, the wheel setting and the part tilt. A part of their corrections
+    /// changes the surface like a motion of the part. Registration removes this part from the measurement.
     pub fn apparent_mm(&self) -> Cow<'_, [f64]> {
         self.add_parameter_effect(|set| &set.seen_mm)
     }
 
-    /// Returns the total displacement of the surface by this correction, at every node, in millimetres along the
-    /// normal; positive leaves material. This is `values_mm` plus the displacement by the parameter corrections
-    /// ([`ParameterCorrections::displaced_mm`]). The amount of removed material follows from this displacement.
+    /// Returns the total displacement of the surface by this correction at every node, in millimetres along the normal.
+    /// A positive displacement leaves material. This is `values_mm` plus the displacement by the corrections of the
+    /// machine parameters wheel radius, wheel setting and part tilt ([`ParameterCorrections::displaced_mm`]). Without
+    /// such corrections, returns `values_mm`.
+    ///
+    /// The amount of removed material follows from this displacement.
     pub fn displacement_mm(&self) -> Cow<'_, [f64]> {
         self.add_parameter_effect(|set| &set.displaced_mm)
     }
 
-    /// Returns the map to send to the grinder, at every node, in millimetres. This is `values_mm` plus the displacement
-    /// by the corrections of wheel setting and part tilt ([`ParameterCorrections::setting_mm`]).
+    /// Returns the displacement map that the grinder receives, at every node, in millimetres. This is `values_mm` plus
+    /// the displacement by the corrections of the wheel setting and the part tilt
+    /// ([`ParameterCorrections::setting_mm`]). The wheel setting is the offset of the wheel in x, y and z. Without such
+    /// corrections, returns `values_mm`.
     ///
-    /// A correction of the wheel radius is not part of the map, because the grinder has a separate input for this
-    /// radius. It has no inputs for setting and tilt.
+    /// The grinder has no inputs for setting and tilt, so the map must contain their effect. The grinder has an input
+    /// for the wheel radius, so the map does not contain the effect of a corrected radius.
     pub fn map_mm(&self) -> Cow<'_, [f64]> {
         self.add_parameter_effect(|set| &set.setting_mm)
     }

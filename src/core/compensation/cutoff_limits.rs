@@ -21,14 +21,16 @@ pub fn contact_width_mm(wheel_radius_mm: f64, depth_mm: f64) -> f64 {
     2.0 * (2.0 * wheel_radius_mm * depth_mm - depth_mm * depth_mm).max(0.0).sqrt()
 }
 
-/// Checks that a cut-off is long enough. The minimum is twice the contact width of the wheel or twice the distance of
-/// the points, whichever is larger. A cut-off of at least 0.9 times this minimum passes the check, because the
-/// estimated distance has an uncertainty of 10 %. The wheel cannot grind a shorter wave, or the points do not resolve
-/// it. All values are in millimetres.
+/// Checks that the cut-off wavelength `cutoff_mm` is not too short. All values are in millimetres. `contact_width_mm`
+/// is the width on which the wheel touches the part. `point_spacing_mm` is the distance of the measured points.
+///
+/// The minimum cut-off is twice the contact width or twice the distance of the points, whichever is larger. Either the
+/// wheel cannot grind a wave that is shorter than this minimum, or the points cannot resolve this wave. The check
+/// accepts a cut-off from 0.9 times the minimum, because the estimated distance has an uncertainty of 10 %.
 ///
 /// # Errors
-/// Returns [`MapError::CutoffBelowContact`] if the contact width is larger than the distance of the points, otherwise
-/// [`MapError::CutoffBelowSpacing`].
+/// Returns [`MapError::CutoffBelowContact`] if the cut-off is too short and the contact width is larger than the
+/// distance of the points. Returns [`MapError::CutoffBelowSpacing`] if the cut-off is too short otherwise.
 pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_mm: f64) -> Result<(), MapError> {
     let least_mm = 2.0 * contact_width_mm.max(point_spacing_mm);
     // 10 % is the uncertainty of an estimated spacing.
@@ -42,23 +44,28 @@ pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_
     })
 }
 
-/// Estimates the distance between neighbouring readings along x and along y, and returns the larger of the two, in
-/// millimetres. Returns 0 if no reading has a neighbour at another place.
+/// Estimates the distance between neighbouring readings along x and along y, and returns the larger of the two
+/// distances, in millimetres. A reading is a measured deviation with its place (x, y). Returns 0 if no reading has a
+/// neighbour at another place.
 ///
-/// The estimate uses a sample of at most 50 readings. For each of them, it finds the nearest other reading in each of
-/// four sectors: about +x, -x, +y and -y. The distance along x is the median of the distances found in the sectors
-/// about +x and -x. The distance along y follows from the other two sectors. Repeated readings of one place count as
-/// one.
+/// The estimate uses a sample of at most 50 readings. For each reading of the sample, finds the nearest other reading
+/// in each of four sectors. The sectors are centred on the directions +x, -x, +y and -y, and each is 90 degrees wide.
+/// The distance along x is the median of the distances in the sectors +x and -x. The distance along y is the median of
+/// the distances in the sectors +y and -y. Several readings at one place count as one.
 ///
-/// For scan lines that are dense along x and far apart along y, the result is the distance between the lines.
+/// Example: for scan lines with dense readings along x and a large distance along y, the result is the distance between
+/// the lines.
 pub fn point_spacing_mm(readings: &[DeviationSample]) -> f64 {
     let [x, y] = point_spacings_mm(readings);
     x.max(y)
 }
 
-/// Estimates the distance between neighbouring readings, and returns it along x and along y, in millimetres. Each
-/// estimate is the median distance from a reading to the nearest other reading in the directions of this axis, see
-/// [`point_spacing_mm`]. An element is 0 if no reading has a neighbour in the directions of this axis.
+/// Estimates the distance between neighbouring readings along x and along y, and returns these two distances in
+/// millimetres. A reading is a measured deviation with its place (x, y). The first distance is the median distance from
+/// a reading to the nearest other reading in the sectors around +x and -x. The second distance is the same for the
+/// sectors around +y and -y. Each sector is 90 degrees wide. Uses a sample of at most 50 readings.
+///
+/// A distance is 0 if no reading has a neighbour in the sectors of this axis.
 pub(super) fn point_spacings_mm(readings: &[DeviationSample]) -> [f64; 2] {
     let step = readings.len().div_ceil(PROBED).max(1);
     let chosen: Vec<&DeviationSample> = readings.iter().step_by(step).collect();
@@ -74,8 +81,9 @@ pub(super) fn point_spacings_mm(readings: &[DeviationSample]) -> [f64; 2] {
     [median([0, 1]), median([2, 3])]
 }
 
-/// Returns the node spacing, in millimetres, of a square grid that has as many nodes as there are readings and covers
-/// their bounding box.
+/// Returns the average spacing of the readings, in millimetres: sqrt(A / n). A is the area of the bounding box of the
+/// readings in x and y, and n is their number. A square grid with this spacing has about n nodes in the box. Returns 0
+/// if there are no readings or if the box has no area.
 fn square_spacing_mm(readings: &[DeviationSample]) -> f64 {
     let [width, depth] = [0, 1].map(|axis| {
         let along = readings.iter().map(|r| r.place_mm[axis]);
@@ -84,9 +92,12 @@ fn square_spacing_mm(readings: &[DeviationSample]) -> f64 {
     (width.max(0.0) * depth.max(0.0) / readings.len().max(1) as f64).sqrt()
 }
 
-/// Returns the distances, in millimetres, from the place `[x, y]` to the nearest reading in each of four sectors, in
-/// the order +x, -x, +y, -y. A sector contains the directions within 45 degrees of its axis. Ignores readings at a
-/// distance of at most `same_mm`, because they repeat the same place. Returns infinity for a sector without a reading.
+/// Finds the nearest reading to the place `[x, y]` in each of four sectors, and returns the four distances in
+/// millimetres. The sectors contain the directions within 45 degrees of +x, -x, +y and -y. The result is in this order.
+/// A sector without a reading has the distance infinity.
+///
+/// Ignores readings at a distance of at most `same_mm` in millimetres, because such readings repeat a measurement at
+/// the same place.
 fn nearest_by_sector([x, y]: [f64; 2], readings: &[DeviationSample], same_mm: f64) -> [f64; 4] {
     let mut nearest2 = [f64::INFINITY; 4];
     for r in readings {

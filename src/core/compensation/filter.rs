@@ -61,14 +61,15 @@ pub enum FilterOrder {
 }
 
 impl FilterOrder {
-    /// Returns alpha, the constant that scales the width of the weights exp(-pi (r / (alpha cutoff))^2), where r is the
-    /// distance of a reading from the place of the filtered value. Alpha is chosen so that a wave with the wavelength
-    /// `cutoff` keeps half of its amplitude.
+    /// Returns the constant alpha of the Gaussian filter. The filter weights a reading (a value at a place) with
+    /// exp(-pi (r / (alpha cutoff))^2). Here r is the distance of the reading from the place of the filtered value, and
+    /// cutoff is the cut-off wavelength. With this alpha, a wave with the cut-off wavelength keeps half of its
+    /// amplitude.
     ///
-    /// Let u = pi (alpha cutoff / wavelength)^2. Filters of order 0 and 1 (constant, plane) pass the share exp(-u) of
-    /// the amplitude. The filter of order 2 (quadric) passes (1 + u) exp(-u). The share is one half at u = ln 2 for
-    /// orders 0 and 1, and at u = 1.678347 for order 2. At wavelength = cutoff, u is pi alpha^2, so alpha = sqrt(u /
-    /// pi).
+    /// Derivation: let u = pi (alpha cutoff / wavelength)^2. A filter of order 0 or 1 (constant, plane) passes the
+    /// share exp(-u) of the amplitude. A filter of order 2 (quadric) passes the share (1 + u) exp(-u). The share is one
+    /// half at u = ln 2 for orders 0 and 1, and at u = 1.678347 for order 2. At wavelength = cutoff, u is pi alpha^2.
+    /// Therefore alpha = sqrt(u / pi).
     pub fn alpha(self) -> f64 {
         match self {
             Self::Constant | Self::Plane => 0.469_718_639_349_825_66,
@@ -97,7 +98,9 @@ const TERMS: [[usize; 2]; 6] = [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]];
 /// Number of moments up to the fourth degree.
 const MOMENTS: usize = 15;
 
-/// Returns the index of the moment of x^a y^b in a list of moments. The list is ordered by the degree a + b, then by b.
+/// Returns the index of the moment with the exponents `a` and `b` in a list of moments. This moment is the sum of
+/// weight times x^a y^b over points. The list is ordered by the degree a + b, and within a degree by b: 1, x, y, x^2, x
+/// y, y^2, and so on.
 const fn moment(a: usize, b: usize) -> usize {
     (a + b) * (a + b + 1) / 2 + b
 }
@@ -130,11 +133,13 @@ pub(super) struct FilterResult {
 }
 
 impl GaussianFilter {
-    /// Returns the leverage of a reading multiplied by the number of readings per square millimetre, in 1/mm². The
-    /// leverage is the change of the filtered value per unit change of a reading at the same place. The result applies
-    /// far from edges and holes, and does not depend on the density of the readings.
+    /// Returns the product of the leverage of a reading and the density of the readings, in 1/mm². The leverage is the
+    /// change of the filtered value at a place per unit change of a reading at the same place. The density is the
+    /// number of readings per square millimetre. The product is the same for every density. The result is valid far
+    /// from edges and holes.
     ///
-    /// Equation: 1 / (alpha cutoff)^2 for orders 0 and 1, and 2 / (alpha cutoff)^2 for order 2.
+    /// Equation: 1 / (alpha cutoff)^2 for orders 0 and 1, and 2 / (alpha cutoff)^2 for order 2. Alpha is the constant
+    /// [`FilterOrder::alpha`].
     pub fn open_leverage(&self) -> f64 {
         let weight = (self.order.alpha() * self.cutoff_mm).powi(2);
         if self.order == FilterOrder::Quadric { 2.0 / weight } else { 1.0 / weight }
@@ -277,15 +282,19 @@ fn fit_node(order: FilterOrder, sums: &[Vec<Vec<f64>>; 3], i: usize) -> NodeFit 
     }
 }
 
-/// Fits a polynomial with P terms to the readings around a node by weighted least squares. Returns its height and
-/// slopes at the node, and the leverage and the relative variance of the height. Slopes are per standard deviation of
-/// the weights. The relative variance is the variance of the height divided by the variance of one reading.
+/// Fits a polynomial with P terms (1: constant, 3: plane, 6: quadric) to the readings around a node by weighted least
+/// squares. Returns five values at the node: the height of the polynomial, its slope along x, its slope along y, the
+/// leverage and the relative variance.
+///
+/// - The slopes are the change of the height per standard deviation of the weights. They are 0 for a constant.
+/// - The leverage is the change of the height per unit change of a reading of weight 1 at the node.
+/// - The relative variance is the variance of the height divided by the variance of one reading.
 ///
 /// `weight`, `value` and `weight2` hold the moments of the weights, of the weighted values and of the squared weights,
 /// in the order of [`moment`].
 ///
-/// Returns `None` if the readings do not surround the node closely ([`is_one_sided`]), if they do not determine the
-/// polynomial, or if the relative variance exceeds [`MAX_VARIANCE`].
+/// Returns `None` if the readings do not surround the node closely ([`is_one_sided`]), if the readings do not determine
+/// the polynomial, or if the relative variance exceeds [`MAX_VARIANCE`].
 fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2: &[f64; MOMENTS]) -> NodeFit {
     if is_one_sided(weight) {
         return None;
@@ -354,13 +363,16 @@ impl GridSums {
     }
 }
 
-/// Distributes each reading with Gaussian weights over the 7 x 7 nodes around it. Returns three sums for each node: of
-/// the weights, of the weighted values, and of the squared weights (omitted if `weights` is `None`, because they equal
-/// the weights).
+/// Distributes each reading over the 7 x 7 nodes around its place, with a Gaussian weight for each node. Returns three
+/// sums for each node: the sum of the weights, the sum of the weighted values, and the sum of the squared weights. If
+/// `weights` is `None`, omits the third sum, because it then equals the first sum.
 ///
 /// `places` holds the position `[x, y]` of each reading in millimetres, and `values` its value. `weights` holds a
-/// factor from 0 to 1 for each reading; `None` means the factor 1 for all. The sums cover `grid` and additional nodes
-/// on each side; `border` is their number along x and along y.
+/// factor from 0 to 1 for each reading. `None` means the factor 1 for all readings. The squared weights contain the
+/// square of this factor.
+///
+/// The sums belong to the nodes of `grid` and of a border around `grid`. `border` is the width of this border on each
+/// side, in nodes along x and along y.
 fn spread_readings(
     places: &[[f64; 2]],
     values: &[f64],
@@ -433,17 +445,20 @@ fn spread_reading(
     }
 }
 
-/// Returns one-dimensional convolution kernels for the powers k from 0 to `most`. Kernel k is applied to the sums of
-/// [`spread_readings`] along one axis. The result at a node is the sum of weight times t^k over the readings, where t
-/// is the distance of a reading from the node along this axis. The weight is exp(-(`scale` t)^2 / 2). Each kernel has 2
-/// `taps` + 1 values, one for each node.
+/// Returns one-dimensional convolution kernels for the powers k = 0 to `most` (at most 4). Kernel k computes a moment
+/// from the sums of [`spread_readings`] along one axis. The moment at a node is the sum of w t^k over the readings.
+/// Here t is the distance of a reading from the node along this axis, with its sign, and w = exp(-(`scale` t)^2 / 2) is
+/// the weight of the reading.
 ///
-/// t, `step` and `spread` are in standard deviations of the filter. `step` is the node spacing. `spread` is the
-/// standard deviation of the Gaussian with which [`spread_readings`] has distributed the readings.
+/// Each kernel has 2 `taps` + 1 values: one for the node itself and one for each of the `taps` nodes on both sides. t,
+/// `step` and `spread` are in standard deviations of the filter weights. `step` is the node spacing. `spread` is the
+/// standard deviation of the Gaussian with which [`spread_readings`] has distributed the readings; 0 means not
+/// distributed.
 ///
 /// Method: let G be the required Gaussian weight, and S the Gaussian of the distribution. T is the narrower Gaussian
-/// with G = S * T (convolution). t^k G is a sum of derivatives of G. Each derivative of G is the convolution of S with
-/// the same derivative of T, and a derivative of T is a Hermite polynomial times T.
+/// with G = S * T, where * is the convolution. Then t^k G is a sum of derivatives of G. Each derivative of G is the
+/// convolution of S with the same derivative of T. A derivative of T is a Hermite polynomial times T. Therefore kernel
+/// k is a polynomial times T.
 fn kernels(most: usize, scale: f64, step: f64, spread: f64, taps: usize) -> Vec<Vec<f64>> {
     let tau = (1.0 - (scale * spread).powi(2)).sqrt();
     let (t1, t2) = (1.0 / tau, 1.0 / (tau * tau));
@@ -494,14 +509,14 @@ impl RowSums {
         Self { columns, powers }
     }
 
-    /// Returns the moments at the nodes of one row. For each pair a, b with a + b up to `degree`, the moment is the sum
-    /// of q x^a y^b over the readings. Here q is the weight, the weighted value or the squared weight of a reading,
-    /// depending on the input of [`Self::along_x`]. x and y are the distances of the reading from the node, in standard
-    /// deviations of the filter. The outer list is in the order of [`moment`]; each inner list has one value for each
-    /// node of the row.
+    /// Returns the moments at all nodes of the grid row with the index `row`. A moment at a node is the sum of q x^a
+    /// y^b over the readings. Here x and y are the distances of a reading from the node, in standard deviations of the
+    /// filter weights. q is the weight, the weighted value or the squared weight of the reading; the input of
+    /// [`Self::along_x`] determines which of them.
     ///
-    /// `kernels` holds the convolution kernels along y for the powers 0 to `degree`. `row` is the index of the row in
-    /// the grid.
+    /// The outer list has one entry for each pair of exponents a, b with a + b up to `degree`, in the order of
+    /// [`moment`]. Each inner list has one value for each node of the row. `kernels` holds the convolution kernels
+    /// along y for the powers 0 to `degree` (at least).
     fn along_y(&self, kernels: &[Vec<f64>], degree: usize, row: usize) -> Vec<Vec<f64>> {
         let mut moments = vec![vec![0.0; self.columns]; terms(degree)];
         for (a, sums) in self.powers.iter().enumerate().take(degree + 1) {
@@ -630,13 +645,15 @@ impl FilterResult {
         trend.put_back(&self.grid, |k| supported[k], &mut self.values, &mut self.slopes);
     }
 
-    /// Returns `[value, leverage, variance]` (see the fields of [`FilterResult`]), interpolated at the place `[x, y]`.
-    /// Returns `None` if none of the four nodes around the place is supported.
+    /// Returns `[value, leverage, variance]` of the filter result, interpolated at the place `[x, y]` in millimetres.
+    /// The three numbers are described at the fields of [`FilterResult`]. For a place outside the grid, uses the nodes
+    /// of the nearest grid cell. Returns `None` if none of the four nodes of the grid cell is supported. A node is
+    /// supported if there are enough readings around it, not all of them on one side.
     ///
     /// The interpolation is bilinear. For the value, each of the four nodes contributes its value plus half of the rise
-    /// along its slope from the node to the place. This is exact for quadrics: the second-order errors of values and
-    /// slopes cancel. If some of the four nodes are not supported, the other nodes contribute with the full rise along
-    /// their slopes.
+    /// along its slope from the node to the place. This is exact for quadrics, because the second-order errors of
+    /// values and slopes cancel. If some of the four nodes are not supported, only the supported nodes contribute, with
+    /// the full rise along their slopes.
     pub fn at(&self, place: [f64; 2]) -> Option<[f64; 3]> {
         let grid = &self.grid;
         let [(i, u), (j, v)] = grid.cell(place);

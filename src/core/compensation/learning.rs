@@ -155,15 +155,17 @@ pub struct PassObservation<'a> {
 pub type ParameterExplainer<'a> = &'a (dyn Fn(&[f64]) -> Vec<f64> + Sync);
 
 impl LearningState {
-    /// Creates the initial state for a recipe, before any pass. The response is 1 (as commanded), and the repeatable
-    /// error is unknown.
+    /// Creates the initial state for a recipe, before any pass. The repeatable error (the error that is the same in
+    /// every pass) is unknown. The response (the change of the surface divided by the commanded change of the
+    /// correction) starts at 1.
     ///
-    /// `rule` selects how the gain is computed. The cut-off of `map` is the shortest wavelength. With
-    /// [`GainRule::Wavelength`], the wavelengths from this cut-off up to half of the longer side of the part are
-    /// divided into octaves (bands). `size_mm` is the extent of the part along x and y.
+    /// `rule` selects how the gain is computed. The cut-off wavelength of `map` is the shortest wavelength of the
+    /// state. With [`GainRule::Wavelength`], the wavelengths from this cut-off up to half of the longer side of the
+    /// part are divided into bands of one octave each. With any other rule there is one band. `size_mm` is the extent
+    /// of the part along x and y.
     ///
-    /// `repeatability_mm` is the rms of the non-repeatable error of a pass (grinding and measuring), or `None` if it is
-    /// unknown. Its square is divided equally between the bands.
+    /// `repeatability_mm` is the rms of the non-repeatable error of a pass (grinding and measuring), or `None` if this
+    /// rms is unknown. The mean square `repeatability_mm`^2 is divided equally between the bands.
     pub fn new(rule: GainRule, map: &MapOptions, size_mm: [f64; 2], repeatability_mm: Option<f64>) -> Self {
         let mut edges = vec![map.cutoff_mm];
         if rule == GainRule::Wavelength {
@@ -198,10 +200,11 @@ impl LearningState {
     }
 
     /// Returns the state after the measured pass `seen`. The new state contains the updated estimate of the repeatable
-    /// error, and [`Self::next_correction_mm`] of the new state gives the next correction.
+    /// error. [`Self::next_correction_mm`] of the new state gives the next correction.
     ///
-    /// If the measured response shows that the pass was not ground as commanded (for example mirrored), all estimates
-    /// stay unchanged. The next correction is then the same as the correction of this pass.
+    /// The response in `seen` compares the measured change of the surface with the commanded change. If this response
+    /// shows that the pass was not ground as commanded (for example mirrored), all estimates stay unchanged. The next
+    /// correction is then the same as the correction of this pass.
     pub fn updated(&self, seen: &PassObservation) -> Self {
         let mut known = self.clone();
         if seen
@@ -251,8 +254,10 @@ impl LearningState {
         self.wanted_mm.as_deref()
     }
 
-    /// Returns the state for the start of the next part of the same recipe. Keeps the learned error and the response,
-    /// but increases their uncertainties. Removes the next correction, because it belongs to the previous part.
+    /// Returns the state for the start of the next part of the same recipe. The new state contains the learned
+    /// repeatable error and the learned response (the change of the surface divided by the commanded change). Both have
+    /// a larger uncertainty than before. The new state has no next correction, because the next correction belongs to
+    /// the previous part.
     pub fn for_next_part(&self) -> Self {
         let mut known = self.clone();
         for band in known.bands.iter_mut().chain([&mut known.whole]) {
@@ -264,9 +269,12 @@ impl LearningState {
         known
     }
 
-    /// Forecasts the rms of the error after the next pass, in millimetres, with its standard deviation and its lower
-    /// limit. `error` is the map measured after the last pass. `scallops_mm` is the rms of the scallops (grooves
-    /// between the tracks of the wheel).
+    /// Forecasts the rms of the error after the next pass, in millimetres, with the standard deviation of this rms. The
+    /// result also contains the lowest rms that any correction can reach. This lowest rms is `None` if the
+    /// non-repeatable error is unknown.
+    ///
+    /// `error` is the map measured after the last pass. `scallops_mm` is the rms of the scallops (grooves between the
+    /// tracks of the wheel), in millimetres.
     ///
     /// The forecast includes structure that is too fine for the map: noise of the points, and scallops. If the probe
     /// reaches the bottom of the grooves, the residuals of the map already contain the scallops. So the forecast uses
@@ -310,9 +318,10 @@ impl LearningState {
         self.bands.iter().map(|band| [band.from_mm, self.compensated_share(band)]).collect()
     }
 
-    /// Returns the share of the newest error that the next correction compensates in `band`. For [`GainRule::Fixed`]
-    /// this is the fixed gain. For the other rules it is the Kalman gain times the share that remains after shrinkage,
-    /// from 0 to 1.
+    /// Returns the share of the newest error that the next correction compensates in `band`, the estimate for one band
+    /// of wavelengths. For [`GainRule::Fixed`] the share is the gain that the rule contains. For the other rules the
+    /// share is from 0 to 1. It is the Kalman gain times the Wiener share (the share of the learned mean error that
+    /// remains after it was reduced for its noise).
     fn compensated_share(&self, band: &Band) -> f64 {
         if let GainRule::Fixed(share) = self.rule { share } else { band.gain * band.share }
     }
@@ -323,8 +332,9 @@ impl LearningState {
         self.response
     }
 
-    /// Returns the rms of the non-repeatable error of a pass, in millimetres. Returns `None` if it was not stated and
-    /// no two passes have given an estimate.
+    /// Returns the rms of the non-repeatable error of a pass (grinding and measuring), in millimetres. The value was
+    /// given at the start, taken from other machines, or estimated from at least two passes. Returns `None` if there is
+    /// no such value yet.
     pub fn repeatability_mm(&self) -> Option<f64> {
         self.whole.noise_mm2().map(f64::sqrt)
     }
@@ -358,9 +368,10 @@ impl LearningState {
             && self.bands.windows(2).all(|w| w[0].from_mm < w[1].from_mm)
     }
 
-    /// Splits a map into its bands of wavelengths. Returns one map for each band, from the shortest waves to the
-    /// longest; the returned maps add up to the given map. `rest` holds the values of the given map. `told` gives the
-    /// grid of these values and the valid nodes; its error is not used.
+    /// Splits the map `rest` into bands of wavelengths. `rest` has one value for each node. Returns one map for each
+    /// band of this state, from the shortest waves to the longest. The sum of the returned maps is `rest`.
+    ///
+    /// `told` gives the grid of `rest` and the nodes that are valid. The error values in `told` are not used.
     pub(super) fn split_bands(&self, told: &ResampledError, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
         let whole = rest.clone();
@@ -374,14 +385,17 @@ impl LearningState {
     }
 
     /// Returns the mean square of the noise in each band of an error map, in mm², from the shortest waves to the
-    /// longest. This noise comes from the noise of the measured points. `whole_mm2` is its mean square in all bands
-    /// together, in mm².
+    /// longest. This noise comes from the noise of the measured points. `whole_mm2` is the mean square of the noise in
+    /// the unsplit map, in mm².
     ///
-    /// Equation: white noise that has passed a Gaussian low-pass filter of width s has a mean square proportional to 1
-    /// / s^2. The difference of two such filters, of widths s and t, gives 1 / s^2 + 1 / t^2 - 4 / (s^2 + t^2). The map
-    /// has already passed the filter with the shortest cut-off. So s^2 and t^2 are the square of the width of that
-    /// filter plus the square of the width of the filter of the band. All widths are relative to that of the first
-    /// filter.
+    /// Equation: white noise after a Gaussian low-pass filter of width s has a mean square proportional to 1 / s^2. A
+    /// band is the difference of two low-pass filters of the widths s and t, one for each end of the band. Its mean
+    /// square is proportional to 1 / s^2 + 1 / t^2 - 4 / (s^2 + t^2). The last band is a single low-pass filter: 1 /
+    /// s^2.
+    ///
+    /// The map has already passed the filter with the shortest cut-off, and this filter has the width 1. A second
+    /// filter with the cut-off ratio w (its cut-off divided by the shortest cut-off) gives the total width s^2 = 1 +
+    /// w^2. At the short end of the first band there is no second filter, so s^2 = 1.
     ///
     /// The result applies far from edges. Near the border, the longest waves can contain up to twice as much noise.
     fn band_noise_mm2(&self, whole_mm2: f64) -> Vec<f64> {
@@ -438,8 +452,10 @@ impl Band {
         (count > 0.0).then(|| sum / count)
     }
 
-    /// Returns true if the noise variance of this band was only stated for all bands together, or taken over from other
-    /// machines, and no pass of this machine has estimated it yet.
+    /// Returns true if the noise variance of this band is known only by an assumption. Such a variance is an equal part
+    /// of one value that was given for all bands together, or it comes from other machines. The total weight of the
+    /// estimates of the variance is then above 0 and below 1, where a full estimate from a pass has the weight 1.
+    /// Returns false if the variance is unknown.
     fn is_guessed(&self) -> bool {
         self.scatter[1] > 0.0 && self.scatter[1] < 1.0
     }
@@ -476,10 +492,16 @@ impl Band {
         self.borrowed *= 1.0 - self.gain;
     }
 
-    /// Computes the share of the learned mean error that remains after Wiener shrinkage (see the module), from 0 to 1,
-    /// and stores it in `share`. `mean_mm2` is the mean square of the mean error in this band, in mm². `noise_mm2` is
-    /// the mean square of the noise of the measured points in this band; it is used only if the variance of the
-    /// non-repeatable error is unknown.
+    /// Computes the Wiener share of this band, from 0 to 1, and stores it in `share`. The next correction uses this
+    /// share of the learned mean error.
+    ///
+    /// Equation: with c = `mean_mm2` / v, the share is 1 - 1 / c, at least 0. If the noise variance is only an
+    /// assumption, the share is 1 - (1 - exp(-c)) / c. Here v is the variance of the mean error: the variance of the
+    /// non-repeatable error times the variance ratio of this band (1 if the ratio is unknown).
+    ///
+    /// `mean_mm2` is the mean square of the mean error in this band, in mm². `noise_mm2` is the mean square of the
+    /// noise of the measured points in this band, in mm². It replaces the variance of the non-repeatable error if this
+    /// variance is unknown.
     fn shrink(&mut self, mean_mm2: f64, noise_mm2: f64) {
         let of_mean_mm2 = self.noise_mm2().unwrap_or(noise_mm2) * self.belief.unwrap_or(1.0);
         let over = mean_mm2 / of_mean_mm2;
@@ -488,7 +510,8 @@ impl Band {
         self.share = if share.is_nan() { 1.0 } else { share.max(0.0) };
     }
 
-    /// Returns the number of independent values that the valid area of `told` contains in this band, at least 1.
+    /// Returns how many statistically independent values an error map contains for the waves of this band, at least 1.
+    /// `told` is the error map. The number is proportional to the area of its valid nodes.
     pub(super) fn independent(&self, told: &ResampledError) -> f64 {
         let [dx, dy] = told.grid.spacing_mm;
         let area_mm2 = dx * dy * told.valid.iter().filter(|valid| **valid).count() as f64;

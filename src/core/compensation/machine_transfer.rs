@@ -129,9 +129,10 @@ impl MachineSimilarity {
     /// machines. The share is a ratio of mean squares, from 0 to 1, for the band of wavelengths that begins at
     /// `from_mm`. Returns `None` if no comparison covers this band.
     ///
-    /// The share is the mean over n comparisons, increased by the factor 1 + 1/n for the uncertainty of few
-    /// comparisons, and limited to 1. If the comparisons with the receiving machine alone give a larger share, returns
-    /// that share.
+    /// The share is the mean over n comparisons, multiplied by 1 + 1/n because few comparisons are uncertain, and
+    /// limited to 1. The same value is computed from the comparisons that include the machine for which an initial
+    /// state is required. If this second value is larger, it is returned. The statement of a person counts as such a
+    /// comparison.
     pub fn own_share(&self, from_mm: f64) -> Option<f64> {
         let all = self.expected_share(from_mm, |_| true)?;
         Some(self.expected_share(from_mm, |of| of.is_own).map_or(all, |own| own.max(all)))
@@ -233,8 +234,8 @@ fn has_same_bands(one: &LearningState, other: &LearningState) -> bool {
     one.bands.len() == other.bands.len() && one.bands.iter().zip(&other.bands).all(same)
 }
 
-/// Returns an error object in which every node of `grid` is valid. It contains no values, and is used only for its grid
-/// and its valid nodes.
+/// Returns an error map in which every node of `grid` is valid and which has no error values. The caller uses only the
+/// grid and the valid nodes of the result.
 fn zero_error(grid: Grid) -> ResampledError {
     ResampledError { grid, error_mm: Vec::new(), valid: vec![true; grid.len()], noise_mm2: 0.0 }
 }
@@ -294,11 +295,13 @@ fn predicted(machines: &[&BandEvidence], own_share: f64, nodes: usize) -> Option
     Some((values_mm, own + common / rest))
 }
 
-/// Returns the estimate for all wavelengths together, for a machine whose initial state is predicted from the machines
-/// `others`. `own` is the estimate of the machine before the prediction. `variance_mm2` is the variance of the
-/// predicted error in mm².
+/// Returns the band that holds the estimate for all wavelengths together, for a machine whose initial state is
+/// predicted from the machines `others`. `own` is this band of the machine before the prediction. `variance_mm2` is the
+/// variance of the predicted error, in mm².
 ///
-/// The variance of the non-repeatable error is taken from `own`. If `own` has none, the mean over `others` is used.
+/// The result takes the variance of the non-repeatable error from `own`. If `own` has none, the result takes the mean
+/// over those of `others` that have one. The result also contains the ratio of `variance_mm2` to this variance, at
+/// least [`MIN_VARIANCE_RATIO`]. This ratio is `None` if the variance of the non-repeatable error is unknown or 0.
 fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
     let of_others: Vec<f64> = others.iter().filter_map(|other| other.whole.noise_mm2()).collect();
     let others_mm2 = of_others.iter().sum::<f64>() / of_others.len() as f64;

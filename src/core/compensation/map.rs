@@ -107,9 +107,10 @@ pub struct ErrorMap {
 /// node. The weights are exp(-pi (r / (alpha cutoff))^2), where r is the distance of a reading from the node, see
 /// [`FilterOrder::alpha`]. With [`Smoothing::Spline`], a smoothing spline replaces this filter.
 ///
-/// Two neighbouring readings that are far from the surface on the same side are not outliers, but a feature of the
-/// part. The Gaussian filter is repeated to keep at least half of the height of a feature. This fails only for a
-/// feature of which less than an eighth passes the filter.
+/// An outlier is a single reading far from the surface. If a neighbouring reading is also far from the surface on the
+/// same side, both readings are a feature of the part, and they are not rejected. The Gaussian filter alone makes a
+/// small feature too low. So the filter is repeated until the map contains at least half of the height of the feature.
+/// This can fail if one pass of the filter keeps less than an eighth of the height.
 ///
 /// A cut-off that is too short for the wheel or for the distance of the points is not an error. It is reported in
 /// [`ErrorMap::advice`].
@@ -245,9 +246,12 @@ impl ReferenceFilter {
         filter_robust(&self.gaussian, &kept.places, &kept.values, &self.grid)
     }
 
-    /// Returns the standard deviation of a single reading, computed from the differences between the readings `kept`
-    /// and the surface of this reference filter. `filtered` is the surface of the filter of the map. If both filters
-    /// are the same, `filtered` is used and the readings are not filtered again.
+    /// Returns the standard deviation of the noise of a single reading, in the unit of the readings. It is computed
+    /// from the residuals: each reading in `kept` minus the filtered surface.
+    ///
+    /// The surface comes from this reference filter, whose cut-off is at least four distances between readings.
+    /// `filtered` is the surface from the filter of the map. If both filters are the same, `filtered` is used and the
+    /// readings are not filtered again.
     fn point_sigma(&self, kept: &InlierReadings, filtered: &FilterResult) -> f64 {
         if self.is_map_filter {
             return residuals(filtered, &kept.places, &kept.values, None).sigma();

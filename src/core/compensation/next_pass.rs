@@ -70,12 +70,15 @@ pub enum NextPassError {
 }
 
 impl Correction {
-    /// Returns a copy of this correction with new values that compensate the learned error. The number of the pass and
-    /// the level are not changed. No limit is checked.
+    /// Returns a copy of this correction with new values that compensate the learned error. The copy has the same pass
+    /// number and the same level (the height of the target surface above the nominal surface). No limit is checked.
     ///
-    /// `known` is the learned state that gives the required total correction; if it has none, the present correction is
-    /// used. `set` holds the parameter corrections of the next pass, or `None`. Their visible effect is subtracted from
-    /// the values, so that no part of the error is compensated twice.
+    /// `known` is the learned state. It gives the total correction that is required, in millimetres at each node. If
+    /// `known` contains no next correction, the total of the present correction is used.
+    ///
+    /// `set` holds the parameter corrections of the next pass, or `None` if there are none. A parameter correction
+    /// changes the surface. The part of this change that a measurement shows is subtracted from the new values, so that
+    /// no part of the error is compensated twice.
     pub fn compensating(&self, known: &LearningState, set: Option<&ParameterCorrections>) -> Self {
         let seen_mm = self.apparent_mm();
         let mut values_mm = known.next_correction_mm().unwrap_or(&seen_mm).to_vec();
@@ -85,13 +88,13 @@ impl Correction {
         Self { values_mm, set: set.cloned(), ..self.clone() }
     }
 
-    /// Returns the total removal of this correction at the node with the largest removal, in millimetres. The removal
-    /// is measured from the surface that a first pass without correction leaves. `limits` holds the allowance and the
-    /// limits of the recipe.
+    /// Returns the total removal at the node with the largest removal, in millimetres. The total removal is the depth
+    /// of the commanded surface of this correction below the commanded surface of a first pass without correction.
+    /// `limits` holds the limits of the recipe, and the allowance, which is the level of the first pass.
     ///
     /// # Errors
-    /// Returns [`NextPassError::TooLarge`] if the correction exceeds its limit at a node, and
-    /// [`NextPassError::BudgetSpent`] if the removal exceeds the budget in `limits`.
+    /// Returns [`NextPassError::TooLarge`] if the magnitude of a value of the correction exceeds `max_correction_mm` of
+    /// `limits`, and [`NextPassError::BudgetSpent`] if the total removal exceeds `removal_budget_mm` of `limits`.
     pub fn removed_mm(&self, limits: &CorrectionLimits) -> Result<f64, NextPassError> {
         let within = |v: f64| v.abs() <= limits.max_correction_mm;
         if let Some(k) = self.values_mm.iter().position(|v| !within(*v)) {
@@ -112,19 +115,21 @@ impl Correction {
     /// everywhere.
     ///
     /// `self` is the correction of the last pass, `error` the map measured after that pass, and `known` the learned
-    /// state. `set` holds the parameter corrections of the next pass. They compensate a part of the error; the map
-    /// compensates the other part.
+    /// state. `set` holds the parameter corrections of the next pass, or `None`. The parameter corrections compensate a
+    /// part of the error. The values at the nodes of the new correction compensate the other part.
     ///
     /// A pass can only remove material, so the new surface must be below the present surface everywhere. If the
-    /// correction increases by d at a node, the surface rises there by s d, where s is the response of the part. In
-    /// addition, every pass has a non-repeatable error. So the depth is at least the sum of three values: the largest
-    /// rise s d, two standard deviations of the non-repeatable error, and the minimum depth of removal.
+    /// correction increases by d at a node, the surface rises there by s d. Here s is the response of the part (the
+    /// change of the surface divided by the commanded change). In addition, every pass has a non-repeatable error. So
+    /// the depth is at least the sum of three values: the largest rise s d, two standard deviations of the
+    /// non-repeatable error, and the minimum depth of removal. The depth is also at least the standard depth of cut in
+    /// `limits`.
     ///
     /// Frames: x and y of the model frame. Units: millimetres.
     ///
     /// # Errors
     /// Returns an error if the correction exceeds its limit, if the pass is deeper than the machine may cut, or if the
-    /// removal exceeds the budget.
+    /// total removal exceeds the removal budget of `limits`.
     pub fn next_pass(
         &self,
         error: &ErrorMap,

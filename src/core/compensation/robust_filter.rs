@@ -171,14 +171,18 @@ pub(super) struct FarReadings {
 }
 
 impl RobustResult {
-    /// Finds the readings that are far from the filtered surface and divides them into outliers and features. A reading
-    /// is far if its scaled residual (the residual divided by the square root of its freedom) exceeds `limit` times the
-    /// standard deviation of one reading. A far reading is a feature of the part if a neighbouring reading confirms it;
-    /// otherwise it is an outlier.
+    /// Finds the readings that are far from the filtered surface and divides them into outliers and features of the
+    /// part. Returns the indices of the outliers and the indices of the features, each in ascending order. Both lists
+    /// are empty if there are fewer than 20 readings.
     ///
-    /// `places` and `values` are the positions and heights of the readings. `apart` is the distance between
-    /// neighbouring readings along x and along y. Returns the indices of the readings in ascending order. With fewer
-    /// than 20 readings both lists are empty.
+    /// A reading is far if its scaled residual exceeds `limit` times the standard deviation of one reading. The scaled
+    /// residual is the residual divided by the square root of its freedom (the ratio of the variance of the residual to
+    /// the variance of a reading). A far reading is a feature if a neighbouring reading confirms it: the neighbour
+    /// deviates to the same side, by at least half of this limit and at least a quarter as much. Otherwise the far
+    /// reading is an outlier.
+    ///
+    /// `places` and `values` are the positions and heights of the readings. `apart` is the usual distance between
+    /// neighbouring readings along x and along y.
     ///
     /// Returns `None` if more than a tenth of the readings would be outliers, because then the surface itself is
     /// doubtful.
@@ -216,11 +220,13 @@ impl RobustResult {
         (outliers.len() * 10 <= places.len()).then_some(FarReadings { outliers, features })
     }
 
-    /// Returns true if a neighbour confirms the reading with the index `off[n]`: one of its eight neighbours has a
-    /// residual of the same sign and at least a quarter of the size.
+    /// Returns true if a neighbour confirms that one reading belongs to a feature of the part. The index of this
+    /// reading is `off[n]`. A neighbour confirms it if the residual of the neighbour has the same sign and at least a
+    /// quarter of the size. The neighbours are the readings at the eight surrounding nodes of a grid. Only the readings
+    /// in `off` are considered.
     ///
     /// `off` holds the indices of all readings with a large residual, sorted by x. `places` are the positions of all
-    /// readings. `apart` is the distance between neighbouring readings along x and along y.
+    /// readings. `apart` is the usual distance between neighbouring readings along x and along y.
     fn is_feature(&self, n: usize, off: &[usize], places: &[[f64; 2]], apart: [f64; 2]) -> bool {
         let k = off[n];
         let away = |j: usize| [0, 1].map(|axis| places[j][axis] - places[k][axis]);

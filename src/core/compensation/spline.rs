@@ -200,9 +200,12 @@ impl SplineAxis {
 /// Number of entries of a coefficient: with itself and 24 later neighbours.
 const LATER: usize = 25;
 
-/// Returns the storage index (0 to 24) of the matrix entry that couples a spline coefficient with a neighbouring
-/// coefficient. The neighbour is `di` columns and `dj` rows after the coefficient. The function [`offset`] is the
-/// inverse.
+/// Returns the storage index (0 to 24) of the matrix entry that couples a spline coefficient with itself or with one of
+/// its later neighbours. The coefficients form a grid. A later neighbour is in the same row, up to 3 columns to the
+/// right, or in one of the next 3 rows, up to 3 columns to either side.
+///
+/// `di` is the number of columns and `dj` the number of rows from the coefficient to the neighbour. The function
+/// [`offset`] is the inverse.
 fn later(di: isize, dj: isize) -> usize {
     if dj == 0 { di as usize } else { (4 + (dj - 1) * 7 + di + 3) as usize }
 }
@@ -266,8 +269,10 @@ impl<'a> NormalEquations<'a> {
         self.entries.iter().map(|e| self.normal[at(e)] + mu * self.bending[at(e)] + ridge(e)).collect()
     }
 
-    /// Copies the entries of an inverse matrix into the layout of the field `normal`: [`LATER`] entries for each spline
-    /// coefficient, one for itself and one for each later neighbour. The entry is 0 if a neighbour does not exist.
+    /// Copies the entries of the matrix `inverse` into the storage layout of `self.normal`, and returns them. This
+    /// layout has [`LATER`] entries for each spline coefficient: one for the coefficient itself, and one for each later
+    /// neighbour. A later neighbour is a coefficient up to 3 columns and 3 rows away that follows in the order row by
+    /// row. The entry is 0 if the neighbour does not exist.
     fn spread(&self, inverse: &SelectedInverse) -> Vec<f64> {
         let nx = self.axes[0].count();
         let mut spread = vec![0.0; self.right.len() * LATER];
@@ -360,16 +365,23 @@ impl<'a> NormalEquations<'a> {
     }
 }
 
-/// Returns the offset `[columns, rows]` from a spline coefficient to one of its later neighbours. `s` is the storage
-/// index (0 to 24) of the matrix entry that couples the two. The function [`later`] is the inverse.
+/// Returns the offset `[columns, rows]` from a spline coefficient to one of its later neighbours. A later neighbour is
+/// a coefficient up to 3 columns and 3 rows away that follows in the order row by row. `s` is the storage index (0 to
+/// 24) of the matrix entry that couples these two coefficients; for 0 the offset is `[0, 0]`. The function [`later`] is
+/// the inverse.
 fn offset(s: usize) -> [isize; 2] {
     if s < 4 { [s as isize, 0] } else { [((s - 4) % 7) as isize - 3, ((s - 4) / 7) as isize + 1] }
 }
 
-/// Returns the sparsity pattern of the matrix for a grid of `nx` x `ny` spline coefficients, as three lists. The first
-/// holds, for each matrix entry, the coefficient and the storage index of a later neighbour inside the grid. The second
-/// holds the position of the first entry of each matrix column, and the total number of entries at the end. The third
-/// holds the matrix row of each entry.
+/// Returns the sparsity pattern of the matrix for a grid of `nx` x `ny` spline coefficients, as three lists. A matrix
+/// entry couples a coefficient with itself or with a later neighbour. A later neighbour is a coefficient up to 3
+/// columns and 3 rows away that follows in the order row by row. Neighbours outside the grid are omitted.
+///
+/// - The first list holds, for each matrix entry, the index of the coefficient and the storage index (0 to 24) of the
+///   neighbour.
+/// - The second list holds the position of the first entry of each matrix column, and the total number of entries at
+///   the end.
+/// - The third list holds the matrix row of each entry.
 fn neighbours(nx: usize, ny: usize) -> (Vec<(u32, u8)>, Vec<usize>, Vec<usize>) {
     let (mut entries, mut begins, mut rows) = (Vec::new(), vec![0], Vec::new());
     for c in 0..nx * ny {

@@ -169,9 +169,12 @@ pub(super) fn solve_least_squares(
     Ok(back_substituted(&r, terms, samples.len()))
 }
 
-/// Solves a least-squares problem by back substitution. `r` is the triangular matrix R of a QR decomposition. The
-/// decomposed matrix has one column for each of the `terms` functions, and the deviations as the last column. `points`
-/// is the number of points.
+/// Solves a least-squares problem by back substitution. Returns the coefficients of the functions, the coefficients of
+/// the orthonormalised functions, the RMS of the residuals, and the index of the first function that the points do not
+/// determine. If there is such a function, the coefficients of the functions are 0.
+///
+/// `r` is the triangular matrix R of a QR decomposition. The decomposed matrix has one row for each point, one column
+/// for each of the `terms` functions, and the deviations as the last column. `points` is the number of points.
 fn back_substituted(r: &DMatrix<f64>, terms: usize, points: usize) -> LeastSquaresSolution {
     let scale = (points as f64).sqrt();
     let undetermined = (0..terms).find(|&k| {

@@ -44,12 +44,20 @@ pub struct Iso10110 {
     pub notation: String,
 }
 
-/// Computes the ISO 10110-5 figures of the deviations of a surface, in nanometres: PV of power, irregularity and its
-/// symmetric part, and RMS of total, irregularity and varying part.
+/// Computes the ISO 10110-5 figures of the deviations of a surface, in nanometres. Piston and tilt are removed first.
+/// The rest has these parts:
 ///
-/// The positions and deviations of the samples are in the model frame, in millimetres. The symmetric part is symmetric
-/// about the centre of the bounding box of `aperture`. `wavelength_nm` only appears in the notation and does not change
-/// the figures.
+/// - total: the deviations without piston and tilt
+/// - power: the part proportional to r^2, where r is the distance from the centre
+/// - irregularity: the total without the power
+/// - symmetric part: the part of the irregularity that is rotationally symmetric about the centre
+/// - varying part: the irregularity without the symmetric part
+///
+/// Returns the PV of power, irregularity and symmetric part, and the RMS of total, irregularity and varying part. Also
+/// returns the height of the power at the rim relative to the centre, and the notation of ISO 10110-5.
+///
+/// The positions and deviations of the samples are in the model frame, in millimetres. The centre is that of the
+/// bounding box of `aperture`. `wavelength_nm` only appears in the notation and does not change the figures.
 ///
 /// # Errors
 /// Returns an error if there are fewer than four points, if they lie on a line, if a number is not finite, or if the
@@ -149,9 +157,10 @@ fn notation(found: &Iso10110) -> String {
 
 /// Formats the figures of a surface as an ISO 10110-5 indication: `3/A(B/C) RMSt<D; RMSi<E; RMSa<F; lambda=G`.
 ///
-/// The first array holds the PV of the power (A), of the irregularity (B) and of the symmetric part (C). The second
-/// array holds the RMS of the total (D), of the irregularity (E) and of the varying part (F). See [`Iso10110`].
-/// `wavelength_nm` is G. All values are in nanometres. A to F are rounded up; the wavelength is not rounded.
+/// The first array holds three PV values: of the power (A), of the irregularity (B), and of the rotationally symmetric
+/// part of the irregularity (C). The second array holds three RMS values: of the total (D), of the irregularity (E),
+/// and of the part of the irregularity that is not symmetric (F). See [`Iso10110`]. `wavelength_nm` is G. All values
+/// are in nanometres. A to F are rounded up; the wavelength is not rounded.
 pub fn iso_10110_notation([a, b, c]: [f64; 3], [total, irregularity, varying]: [f64; 3], wavelength_nm: f64) -> String {
     let [a, b, c, total, irregularity, varying] = [a, b, c, total, irregularity, varying].map(format_rounded_up);
     format!("3/{a}({b}/{c}) RMSt<{total}; RMSi<{irregularity}; RMSa<{varying}; lambda={wavelength_nm}")

@@ -75,9 +75,15 @@ impl IsoFits {
         Some(Self { quadric_terms: base, power: 1.0 / scales[3], power_pv: most - least, symmetric_terms: even })
     }
 
-    /// Computes the ISO 10110-5 figures of one form, in millimetres: PV of power, irregularity and symmetric part, and
-    /// RMS of total, irregularity and varying part. `form` holds one deviation in millimetres for each place of
-    /// [`IsoFits::new`], in the same order.
+    /// Computes the ISO 10110-5 figures of one form, in millimetres. `form` holds one deviation in millimetres for each
+    /// place of [`IsoFits::new`], in the same order.
+    ///
+    /// Piston and tilt are removed first; the rest is the total. The power is the part of the total proportional to
+    /// r^2, where r is the distance from the centre of symmetry. The irregularity is the total without the power. Its
+    /// symmetric part is rotationally symmetric about the centre, and its varying part is the rest.
+    ///
+    /// Returns the PV of power, irregularity and symmetric part, and the RMS of total, irregularity and varying part.
+    /// Also returns the height of the power at the rim relative to the centre.
     pub fn evaluate(&self, form: &[f64]) -> IsoFormValues {
         let n = form.len() as f64;
         let dot = |row: &[f64], with: &[f64]| row.iter().zip(with).map(|(a, b)| a * b).sum::<f64>();

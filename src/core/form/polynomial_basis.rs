@@ -102,8 +102,9 @@ impl PolynomialBasis {
         }
     }
 
-    /// Returns the largest number of terms that does not cut an order of the basis. The number is at most `most` and at
-    /// most [`Self::max_terms`]. Returns 0 if `most` is 0.
+    /// Returns the largest number of terms, at most `most`, that contains only complete orders of the basis. An order
+    /// is a group of terms that belong together, for example all Legendre terms of the same total degree. The number is
+    /// also at most [`Self::max_terms`]. Returns 0 if `most` is 0.
     ///
     /// The possible numbers are 1, 4, 9, 16 and so on for Fringe Zernike. For all other polynomials they are 1, 3, 6,
     /// 10 and so on: all terms up to a degree.

@@ -76,9 +76,12 @@ impl SlopeOperator {
         None
     }
 
-    /// Computes the slope weights at at most [`MAX_NODES`] of the `places`, evenly chosen. The slope at such a node is
-    /// that of the least-squares plane through the values at all places within `radius_mm`. `order` has the indices of
-    /// all places, sorted by x. A place without enough neighbours is skipped.
+    /// Prepares an operator that computes the slopes of a form at up to [`MAX_NODES`] of the `places`, evenly chosen.
+    /// The slope at such a place is that of the least-squares plane through the values at places within `radius_mm`.
+    /// The operator holds the weights of these values.
+    ///
+    /// `order` has the indices of all places, sorted by x. A place is skipped if the places around it do not determine
+    /// a slope: fewer than four, mainly on one side, or along a line.
     fn with_radius(places: &[[f64; 2]], order: &[usize], radius_mm: f64) -> Self {
         let most = places.len().min(MAX_NODES);
         let (mut begins, mut weights) = (vec![0], Vec::new());

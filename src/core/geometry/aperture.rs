@@ -338,7 +338,8 @@ fn validate_polygon(corners: &[[f64; 2]]) -> Result<(), ApertureError> {
     Ok(())
 }
 
-/// Returns the edges of a closed polygon. The last edge returns to the first corner.
+/// Returns the edges of a closed polygon, each as the pair of its start and end corner. The last edge returns to the
+/// first corner.
 fn edges(corners: &[[f64; 2]]) -> impl Iterator<Item = [[f64; 2]; 2]> + '_ {
     corners.iter().zip(corners.iter().cycle().skip(1)).map(|(p, q)| [*p, *q])
 }

@@ -31,7 +31,9 @@ pub struct RigidFit {
 }
 
 impl RigidFit {
-    /// Returns the index of the pair with the largest residual, and the length of that residual in millimetres.
+    /// Returns the index of the pair of points with the largest residual, and the length of this residual in
+    /// millimetres. The residual of a pair is the target point minus the moved point. The index counts from 0, in the
+    /// order of the pairs given to [`fit_rigid`]. Returns `(0, 0.0)` if all residuals are 0.
     pub fn max_residual(&self) -> (usize, f64) {
         let lengths = self.residuals_mm.iter().map(Vector3::norm).enumerate();
         lengths.fold((0, 0.0), |worst, next| if next.1 > worst.1 { next } else { worst })
@@ -130,8 +132,8 @@ fn rms(residuals: &[Vector]) -> f64 {
     (residuals.iter().map(Vector3::norm_squared).sum::<f64>() / residuals.len() as f64).sqrt()
 }
 
-/// Returns the root mean square spread of the points about their centroid along their three principal axes, the largest
-/// first.
+/// Returns the root mean square distances of `points` from their centroid along their three principal axes, in mm. The
+/// largest value comes first.
 fn spreads(points: &[Point]) -> [f64; 3] {
     let middle = centroid(points);
     let scatter: Matrix3<f64> = points.iter().map(|p| (p.coords - middle) * (p.coords - middle).transpose()).sum();

@@ -38,8 +38,11 @@ pub enum SphereFitError {
 /// Minimum number of points: one more than the unknowns, so that the fit can be judged.
 const MIN_POINTS: usize = 5;
 
-/// Fits a sphere by least squares of the distances of the points from the sphere: Gauss-Newton, starting from the
-/// algebraic fit.
+/// Fits a sphere to `points`, in mm. Returns the centre, the radius, the standard uncertainty of the radius and the rms
+/// distance of the points from the sphere.
+///
+/// The fit minimises the sum of the squared distances of the points from the sphere. The method is Gauss-Newton,
+/// starting from a linear (algebraic) fit.
 ///
 /// # Errors
 /// Returns an error if there are fewer than five points, if the points lie on a plane, or if a coordinate is not

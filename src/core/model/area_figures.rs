@@ -66,11 +66,14 @@ pub struct IsoFigures {
 
 impl SlopeFigures {
     /// Computes the slope figures (RMS and maximum slope) with their credible intervals, from random samples of the
-    /// form. Each matrix of `forms` has one column for each sample and one row for each place of `slopes`, in mm.
+    /// form. `slopes` computes the slopes of one sample. Each matrix of `forms` has one column for each sample and one
+    /// row for each place of `slopes`, in mm.
     ///
-    /// The first matrix gives the median and the interval of each figure. The samples in the second matrix have larger
-    /// extremes. They can only raise the upper end of the interval of the maximum slope. `is_seen` is true if a form
-    /// was detected. If it is false, the lower ends of the intervals are 0.
+    /// The first matrix has samples of the posterior. They give the median and the interval of each figure. The second
+    /// matrix has samples of fields with an increased variance, whose extremes are larger. They can only raise the
+    /// upper end of the interval of the maximum slope.
+    ///
+    /// `is_seen` is true if a form was detected. If it is false, the lower ends of the intervals are 0.
     pub(super) fn from_forms(
         slopes: &SlopeOperator,
         forms: &[DMatrix<f64>; 2],
@@ -92,15 +95,17 @@ impl SlopeFigures {
 }
 
 impl IsoFigures {
-    /// Computes the ISO 10110-5 figures with their credible intervals, from random samples of the form. Each matrix of
-    /// `forms` has one column for each sample and one row for each place of `fits`, in mm.
+    /// Computes the ISO 10110-5 figures with their credible intervals, from random samples of the form. `fits` computes
+    /// the figures of one sample. Each matrix of `forms` has one column for each sample and one row for each place of
+    /// `fits`, in mm.
     ///
-    /// The first matrix gives the median and the interval of each figure. The samples in the second matrix have larger
-    /// extremes. They can only raise the upper ends of two intervals: the PV of the irregularity, and the PV of its
-    /// symmetric part.
+    /// The first matrix has samples of the posterior. They give the median and the interval of each figure. The second
+    /// matrix has samples of fields with an increased variance, whose extremes are larger. They can only raise the
+    /// upper ends of two intervals: the PV of the irregularity, and the PV of its symmetric part.
     ///
     /// `is_seen` is true if a form was detected. If it is false, the lower ends of all intervals are 0, except that of
-    /// `power_rim`. The lower end of `power` is also 0 if the sign of the power is uncertain.
+    /// `power_rim` (height of the power at the rim over the centre). The lower end of `power` is also 0 if the sign of
+    /// the power is uncertain.
     pub(super) fn from_forms(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool, inputs: &ModelInputs) -> Self {
         let found = forms.each_ref().map(|forms| map_columns(forms, |form| fits.evaluate(form)));
         let values = |k: usize, of: fn(&IsoFormValues) -> f64| found[k].iter().map(of).collect::<Vec<f64>>();

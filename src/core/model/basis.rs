@@ -102,9 +102,12 @@ impl Basis {
         std::f64::consts::PI / self.squared_wavenumbers.last().copied().unwrap_or(0.0).sqrt()
     }
 
-    /// Computes the prior of a field of variance 1 with the given smoothness and range. Returns the prior standard
-    /// deviation of the coefficient of each basis function, in mm. Also returns the share (0 to 1) of the variance that
-    /// the basis cannot represent: the share of all waves shorter than the shortest cosine.
+    /// Returns the prior standard deviation of the coefficient of each basis function, in mm, for a field with the
+    /// given smoothness and range. The variance of the field is 1, without a unit. The polynomials come first, then the
+    /// cosines.
+    ///
+    /// The second result is the share (0 to 1) of the variance of the field that the basis functions cannot represent.
+    /// This is the share of all waves that are shorter than the shortest cosine.
     ///
     /// The standard deviations of the polynomials are 0 if the field is not differentiable, or if `range_mm` is less
     /// than the longer side of the part.
@@ -139,9 +142,10 @@ impl Basis {
         waves
     }
 
-    /// Evaluates the one-dimensional cosines along one axis at the coordinates `at_mm`. `axis` is 0 for u (along the
-    /// anisotropy of the field) or 1 for v (across it). Returns one vector for each order, from order 0, with one value
-    /// for each coordinate.
+    /// Evaluates the one-dimensional cosines along one axis of the basis at the coordinates `at_mm`. `axis` is 0 for u
+    /// or 1 for v. The axis u is the direction of the longest range of the field (the x axis if the field is
+    /// isotropic). The axis v is perpendicular to u. Returns one vector for each order of the cosines, from order 0.
+    /// Each vector has one value for each coordinate.
     fn cosines(&self, axis: usize, at_mm: &[f64]) -> Vec<Vec<f64>> {
         let length_mm = self.lengths_mm[axis];
         let scale = |order: usize| if order == 0 { 1.0 } else { 2.0_f64.sqrt() } / length_mm.sqrt();
@@ -151,9 +155,10 @@ impl Basis {
         (0..self.counts[axis]).map(of).collect()
     }
 
-    /// Evaluates the Legendre polynomials of one variable at the coordinates `at_mm`. `axis` is 0 for u (along the
-    /// anisotropy of the field) or 1 for v (across it). Returns one vector for each degree, from degree 0, with one
-    /// value for each coordinate.
+    /// Evaluates the Legendre polynomials of one variable at the coordinates `at_mm`. `axis` is 0 for u or 1 for v. The
+    /// axis u is the direction of the longest range of the field (the x axis if the field is isotropic). The axis v is
+    /// perpendicular to u. Returns one vector for each degree, from degree 0. Each vector has one value for each
+    /// coordinate.
     ///
     /// The polynomials are scaled so that their mean square over the part is 1 / L, as for the cosines. L is the length
     /// along this axis of the rectangle on which the cosines are defined.
@@ -173,12 +178,13 @@ impl Basis {
         all
     }
 
-    /// Evaluates the one-dimensional polynomials and cosines at the node coordinates of `grid`, as input of
-    /// [`Self::on_grid`].
+    /// Evaluates the one-dimensional polynomials and cosines at the node coordinates of `grid`. The result is the input
+    /// of [`Self::on_grid`].
     ///
-    /// Returns two matrices: one for the axis u (along the anisotropy of the field), one for the axis v (across it).
-    /// Each has one row for each node along its axis. The columns are the polynomials from degree 0, then the cosines
-    /// from order 0.
+    /// Returns two matrices: the first for the axis u, the second for the axis v. The axis u is the direction of the
+    /// longest range of the field (the x axis if the field is isotropic). The axis v is perpendicular to u. Each matrix
+    /// has one row for each node along its axis. The columns are the polynomials from degree 0, then the cosines from
+    /// order 0.
     pub(super) fn grid(&self, grid: &BasisGrid) -> [Mat<f64>; 2] {
         [0, 1].map(|axis| {
             let at_mm: Vec<f64> =
@@ -189,8 +195,9 @@ impl Basis {
     }
 
     /// Evaluates a field at all nodes of a grid. `coefficients` has the coefficient of each basis function. `along` and
-    /// `across` are the two matrices that [`Self::grid`] returns. Returns a matrix with one row for each node along u
-    /// and one column for each node along v.
+    /// `across` are the two matrices that [`Self::grid`] returns: the one-dimensional basis functions at the node
+    /// coordinates along the two axes u and v of the basis. Returns a matrix of values with one row for each node along
+    /// u and one column for each node along v.
     pub(super) fn on_grid(&self, [along, across]: &[Mat<f64>; 2], coefficients: &[f64]) -> Mat<f64> {
         let mut square = Mat::<f64>::zeros(along.ncols(), across.ncols());
         let (polynomials, cosines) = coefficients.split_at(self.degrees.len().min(coefficients.len()));
@@ -210,14 +217,15 @@ pub(super) struct BasisGrid {
 }
 
 impl BasisGrid {
-    /// Converts the number of a node, from 0, to its two indices: along u (along the anisotropy of the field) and along
-    /// v (across it). The numbers increase along u first.
+    /// Converts the index of a grid node to the indices of the node along the two axes: first along u, then along v.
+    /// The axis u is the direction of the longest range of the field (the x axis if the field is isotropic). The axis v
+    /// is perpendicular to u. All indices count from 0. Nodes are counted row by row, u fastest.
     pub(super) fn indices(&self, node: usize) -> [usize; 2] {
         [node % self.counts[0], node / self.counts[0]]
     }
 
-    /// Returns the coordinates of the node with the number `node`, in mm: u along the anisotropy of the field, v across
-    /// it.
+    /// Returns the coordinates u and v of the grid node with the index `node`, in mm. The axis u is the direction of
+    /// the longest range of the field (the x axis if the field is isotropic). The axis v is perpendicular to u.
     pub(super) fn place(&self, node: usize) -> [f64; 2] {
         let indices = self.indices(node);
         [0, 1].map(|axis: usize| self.corner_mm[axis] + self.spacing_mm * indices[axis] as f64)

@@ -39,15 +39,19 @@ struct VarianceComponents {
     random_effects: Vec<f64>,
 }
 
-/// Computes the uncertainty budget of the figures. `uncertainties_mm` has the standard uncertainties of the root mean
-/// square and of PV 99.8 %, in mm. Each is divided among its sources. Returns one entry for each source; empty if the
-/// variances cannot be computed.
+/// Computes the uncertainty budget of two figures of the form: the root mean square and PV 99.8 % (PV without the
+/// outermost 0.1 % at either end). `uncertainties_mm` has the standard uncertainties of the two figures, in mm. Each is
+/// divided among its sources. Returns one entry for each source of uncertainty, such as the noise or the pose. Returns
+/// no entry if the variances cannot be computed.
 ///
-/// `ground_in` is `None` before the first correction of the part. Later, it has the form that each effect of the
-/// machine has ground into the part, for one standard uncertainty of the effect and after its best fit is subtracted.
-/// It has one row for each place of `drawn` (the sampled forms) and one column for each effect.
-///
-/// `sources` has the source of each column of `ground_in`; without `ground_in`, of each random effect in `observed`.
+/// - `observed` has the observed points and their random effects.
+/// - `sources` has the source of each column of `ground_in`. If `ground_in` is `None`, `sources` has the source of each
+///   random effect in `observed`.
+/// - `fields` and `posterior` are the hypotheses (smoothness and range) of the random field, and their probabilities.
+/// - `drawn` has the sampled forms.
+/// - `ground_in` is `None` before the first correction of the part. Later, each column has the form that one error of
+///   the machine has ground into the part. The size of this error is one standard uncertainty. The best fit of the form
+///   is already subtracted. There is one row for each place of `drawn`.
 pub(super) fn decompose(
     (observed, sources): (&Observations, &[UncertaintySource]),
     (fields, posterior): (&FieldHypotheses, &Posterior),
@@ -79,14 +83,15 @@ pub(super) fn decompose(
     UncertaintySource::ALL.iter().enumerate().map(one).collect()
 }
 
-/// Divides the variance of a linear figure of the form among its sources, in mm^2. The figure is the sum, over
-/// `places`, of the form times the derivative of the figure in `slopes`. Only the most probable hypothesis of the field
-/// (its smoothness, range and variance) is used.
+/// Divides the variance of a figure of the form among its sources. Returns the variance of each source, in mm^2. The
+/// figure is linear in the form: it is the sum over `places` of the form times the element of `slopes` for the place.
+/// An element of `slopes` is the derivative of the figure with respect to the form at this place. Only the most
+/// probable hypothesis (smoothness, range and variance of the random field) is used.
 ///
 /// If the motions of the part were known, the figure would be estimated as w'd. Here d are the observed deviations in
-/// the coordinates of [`FieldHypotheses::coordinates`], and w are their weights. The variance of the error then has
-/// three components: s^2 w'w from the noise s, (w'e)^2 from each random effect e, and the remainder from the field. A
-/// fourth component comes from the pose: the increase of the variance because the motions are unknown.
+/// the reduced coordinates of [`FieldHypotheses::coordinates`], and w are their weights. The variance of the error then
+/// has three components: s^2 w'w from the noise s, (w'e)^2 from each random effect e, and the remainder from the field.
+/// A fourth component comes from the pose: the increase of the variance because the motions are unknown.
 ///
 /// Returns `None` if there is no hypothesis, or if a covariance is singular.
 fn parts(
@@ -149,13 +154,15 @@ fn parts(
     })
 }
 
-/// Computes the derivatives of two figures (the root mean square and PV 99.8 %) with respect to the form at each place.
-/// They are averaged over the sampled forms. The components along the motions of the part are removed, because the best
-/// fit removes these motions from the form.
+/// Returns the derivatives of two figures with respect to the form at each place: of the root mean square, and of PV
+/// 99.8 % (PV without the outermost 0.1 % at either end). The derivatives are averaged over the sampled forms in
+/// `drawn`. Their components along the motions of the part are removed, because the best fit removes these motions from
+/// the form.
 ///
-/// The second result has the mean square, over the sampled forms, of the derivative of each figure along each column of
-/// `ground_in` (the form that an effect of the machine has ground into the part). The mean itself is of no use: the
-/// derivative is as often positive as negative, so its mean is 0.
+/// The second result has one value for each figure and each column of `ground_in`. A column is the form that one error
+/// of the machine has ground into the part. The value is the mean square, over the sampled forms, of the derivative of
+/// the figure in the direction of the column. The mean itself is of no use: the derivative is as often positive as
+/// negative, so its mean is 0. Without `ground_in`, there are no such values.
 fn slopes(drawn: &SampledForms, ground_in: Option<&DMatrix<f64>>) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
     let forms = &drawn.forms[0];
     let (n, count) = forms.shape();

@@ -24,17 +24,18 @@ pub struct EffectEstimates {
 
 impl EffectEstimates {
     /// Estimates the fixed and random effects in `observed` in the presence of an unknown form. The form is a random
-    /// field of unknown strength, range and smoothness; `priors` is the prior of this field. Returns the estimates with
-    /// their covariance.
+    /// field with an unknown standard deviation, range and smoothness. `priors` is the prior of these hyperparameters.
+    /// Returns the estimates with their covariance.
     ///
-    /// For one field, the estimate is that of generalised least squares (Aitken 1935): b = (H'K^-1 H)^-1 H'K^-1 d with
-    /// the covariance (H'K^-1 H)^-1. The columns of H are the effects, d are the deviations, and K is the covariance of
-    /// the points. The result is the mean over the possible fields, weighted with their posterior probabilities
-    /// (Bayesian model averaging). The covariance includes the differences between these fields.
+    /// For one set of hyperparameters, the method is generalised least squares (Aitken 1935): b = (H'K^-1 H)^-1 H'K^-1
+    /// d with the covariance (H'K^-1 H)^-1. The columns of H are the effects, d are the deviations, K is the covariance
+    /// of the points, and b are the estimates. The result is the mean over the probable sets of hyperparameters,
+    /// weighted with their posterior probabilities (Bayesian model averaging). The covariance includes the differences
+    /// between the estimates of these sets.
     ///
     /// # Errors
     /// Returns an error if the prior is invalid, if there are too few points, if one effect is a combination of others,
-    /// if a number is not finite, or if the fields of `observed` have different numbers of rows.
+    /// if a number is not finite, or if the matrices and lists in `observed` have different numbers of rows.
     pub fn estimate(observed: &Observations, priors: &Prior) -> Result<Self, ModelError> {
         priors.check()?;
         let n = observed.places.len();

@@ -184,9 +184,10 @@ impl Form {
     /// Estimates the form of a part at the given `places`, and the figures over all these places. The places need not
     /// be measured points. Each is a point of the nominal surface with its normal, in the model frame.
     ///
-    /// The measured points alone do not distinguish between the noise of the probe and form that is narrower than the
-    /// spacing of the points. Therefore [`ModelInputs::probe_noise_mm`] is required for such narrow form. Narrow form
-    /// is then added as an independent random value at every place.
+    /// Narrow form is form that is narrower than the spacing of the measured points. The points alone cannot
+    /// distinguish it from the noise of the probe. Therefore the noise of the probe in [`ModelInputs::probe_noise_mm`]
+    /// is required. Noise beyond this value counts as narrow form. Narrow form is added as an independent random value
+    /// at every place. If the noise of the probe is unknown (0), all noise counts as noise of the probe.
     ///
     /// # Errors
     /// Returns the errors of [`Form::estimate`].
@@ -299,11 +300,14 @@ impl FittedModel {
         Posterior::new(&self.fields, &self.observed, inputs.prior.as_ref(), noise_prior(inputs))
     }
 
-    /// Evaluates the posterior samples `draws` of the field at `places` (x and y in mm). A motion of the part is added
-    /// to each sample: the motion for which the sample fits the observed deviations best. `effects` has the form that a
-    /// unit of each motion causes, with one row for each place and one column for each motion.
+    /// Evaluates the posterior samples `draws` of the field at `places` (x and y in mm). Returns the sampled forms.
     ///
-    /// If `is_between` is true, the samples are also evaluated between the places ([`IntermediateNodes`]).
+    /// A motion of the part is added to each sample: the motion for which the sample fits the observed deviations best
+    /// (least squares). `effects` has one row for each place and one column for each motion. An element is the
+    /// deviation that one unit of the motion causes at the place.
+    ///
+    /// If `is_between` is true, the samples are also evaluated at grid nodes between the places
+    /// ([`IntermediateNodes`]).
     fn evaluate_samples(
         &self,
         draws: PosteriorSamples,
@@ -355,13 +359,16 @@ impl FittedModel {
         chosen.iter().map(|&k| self.inliers[k]).collect()
     }
 
-    /// Adds the outliers (points that the field does not explain) to the sampled forms. `apart` has their indices among
-    /// all used points. The form at such a point is the measured deviation, minus the random effects and a random noise
-    /// of the probe.
+    /// Adds outliers (points that the field does not explain) to the sampled forms in `drawn`. Returns the extended
+    /// samples. `apart` has the indices of the outliers among all used points. The form at an outlier is the measured
+    /// deviation, minus the random effects and a random noise of the probe.
     ///
-    /// If the places of `drawn` are measured points, the outliers are inserted in the order of measurement. If only a
-    /// part of the measured points is in `drawn`, the same share of the outliers is inserted, the largest first. If the
-    /// places of `drawn` are other places, each outlier replaces the nearest place.
+    /// If the places of `drawn` are measured points, the outliers are inserted in the order of measurement. If `drawn`
+    /// has only a share of the measured points, the same share of the outliers is inserted. These are the outliers with
+    /// the largest absolute deviations.
+    ///
+    /// If the places of `drawn` are not measured points, no place is added. The samples at the place nearest to each
+    /// outlier are replaced.
     fn with_unexplained_points(&self, apart: &[usize], drawn: SampledForms, inputs: &ModelInputs) -> SampledForms {
         let (rows, at_points) = (drawn.places.len(), !drawn.chosen.is_empty());
         let chosen = self.indices_of_all(&drawn.chosen);
@@ -381,12 +388,16 @@ impl FittedModel {
         if at_points { drawn.joined_with(found) } else { drawn.replaced_by(&found) }
     }
 
-    /// Returns samples of the form at outliers (points that the field does not explain). `points` has their indices
-    /// among all used points. For each sample of `drawn`, the form is the measured deviation, minus the random effects
-    /// of this sample and a random noise of the probe. The error of the machine that is ground into the part is also
-    /// subtracted.
+    /// Returns samples of the form at outliers (points that the field does not explain). `points` has the indices of
+    /// the outliers among all used points. There is one sample for each sample of `drawn`. It is the measured
+    /// deviation, minus the random effects of the sample of `drawn` and a random noise of the probe.
     ///
-    /// The result has one row for each point and one column for each sample.
+    /// After a correction, the errors of the machine are ground into the part. In this case a random error of the
+    /// machine is also subtracted.
+    ///
+    /// The result has two sets of samples, each with one row for each outlier and one column for each sample. In the
+    /// first set, each outlier has its own noise value. In the second set, which bounds the extremes, all outliers of a
+    /// sample have the same noise value.
     fn samples_at_points(&self, points: &[usize], drawn: &SampledForms, inputs: &ModelInputs) -> SampledForms {
         let stated = self.all.random_effects.select_rows(points) * &drawn.random_effects;
         let of_probe = |mm: f64| noise_prior(inputs).map_or(mm, |[probe_mm, _]| mm.min(probe_mm));
@@ -465,9 +476,12 @@ impl FittedModel {
         })
     }
 
-    /// Computes the slope figures (RMS and maximum slope) of the sampled forms in `drawn`. Call this function before
-    /// form that is too narrow to be resolved is added to `drawn`, because the slope of such form cannot be measured.
-    /// Returns `None` if there are too few places, or if they are too far apart.
+    /// Computes the slope figures (RMS and maximum slope) of the sampled forms in `drawn`. `inputs` has the integration
+    /// length of the slopes. `posterior` shows whether a form was detected: if not, the lower ends of the intervals are
+    /// 0.
+    ///
+    /// Call this function before form that is too narrow to be resolved is added to `drawn`, because the slope of such
+    /// form cannot be measured. Returns `None` if there are too few places, or if they are too far apart.
     fn slope(&self, inputs: &ModelInputs, posterior: &Posterior, drawn: &SampledForms) -> Option<SlopeFigures> {
         let slopes = SlopeOperator::new(&drawn.places, inputs.area.integration_mm)?;
         let smooth = [0, 1].map(|k| without_best_fit(drawn.forms[k].clone(), &drawn.effects));
@@ -476,11 +490,12 @@ impl FittedModel {
 
     /// Builds the result of the model from the sampled forms in `drawn`. The slopes of the result are `None`.
     ///
-    /// `ends` has the figures (RMS, PV, PV 99.8 %) of further samples. The first set can only lower the lower ends of
-    /// the intervals, the second set can only raise the upper end of the interval of RMS. `ground_in` is the form that
-    /// each effect of the machine has ground into the part: one column for each effect, one row for each place of
-    /// `drawn`. It is `None` before the first correction. If `is_whole` is false, the ISO figures and the budget are
-    /// omitted.
+    /// - `ends` has two sets of further samples. Each entry has the figures RMS, PV and PV 99.8 % of one sample, in mm.
+    ///   The first set can only lower the lower ends of the credible intervals. The second set can only raise the upper
+    ///   end of the interval of RMS. A set can be empty.
+    /// - `ground_in` is `None` before the first correction. Later, each column has the form that one error of the
+    ///   machine has ground into the part, with one row for each place of `drawn`.
+    /// - If `is_whole` is false, the ISO figures and the uncertainty budget are omitted.
     fn form(
         &self,
         inputs: &ModelInputs,
@@ -652,13 +667,19 @@ impl Default for ModelInputs {
     }
 }
 
-/// Returns the covariance of the motions of the part that a least-squares registration finds. The covariance includes
-/// the error that the form causes.
+/// Returns the covariance of the motions of the part that a least-squares registration finds. There is one row and one
+/// column for each motion. The covariance includes the error that the form of the part causes.
 ///
-/// It is A+ (K + s^2) A+' plus the covariance due to `alike` (least squares with correlated errors, Aitken 1935). Here
-/// A+ = (H'H)^-1 H', and H has the fixed effects (motions) as columns. K is the covariance of the field, averaged over
-/// all hypotheses, and s is the standard deviation of the noise. For autocorrelated noise, s^2 is increased. `alike`
-/// has one column for each effect that is common to all points, such as a machine error.
+/// The covariance is A+ (K + s^2) A+' plus the covariance due to `alike` (least squares with correlated errors, Aitken
+/// 1935). The symbols:
+///
+/// - A+ = (H'H)^-1 H', where H has the fixed effects (motions) as columns.
+/// - K is the covariance of the field, averaged over all hypotheses in `fields` with their probabilities in
+///   `posterior`.
+/// - s is the standard deviation of the noise. For autocorrelated noise, s^2 is increased.
+///
+/// `alike` has one row for each point and one column for each effect that is common to all points, such as a machine
+/// error.
 fn best_fit_covariance(
     observed: &Observations,
     (fields, posterior): (&FieldHypotheses, &Posterior),
@@ -674,10 +695,11 @@ fn best_fit_covariance(
     inverse * (scatter2 * (1.0 + drift) / (1.0 - drift)) + covered + &of_alike * of_alike.transpose()
 }
 
-/// Returns a matrix B for random samples of the motion that the form of the part causes in a best fit. If z is a vector
-/// of independent standard normal numbers, B z is such a sample.
+/// Returns a matrix B for random samples of a motion of the part: the motion that a best fit finds only because of the
+/// form. If z is a vector of independent standard normal numbers, B z is one sample. B has one row for each motion.
 ///
-/// B satisfies B B' = A+ K A+', with the symbols of [`best_fit_covariance`].
+/// B satisfies B B' = A+ K A+'. Here A+ = (H'H)^-1 H', H has the fixed effects (motions) as columns, and K is the
+/// posterior average of the covariance of the field.
 fn absorbed_form_factor(observed: &Observations, posterior: &Posterior) -> DMatrix<f64> {
     let rows = &observed.fixed_effects;
     let weights = rows * inverse_of_products(rows);
@@ -730,12 +752,16 @@ impl SampledForms {
     /// Evaluates the posterior samples `draws` of the field at `places` (x and y in mm), and adds a motion of the part
     /// to each sample.
     ///
-    /// `effects` has the form that a unit of each motion causes, with one row for each place and one column for each
-    /// motion. `moved` has one matrix for each of the two variance factors ([`HypothesisSet`]). Its rows are the
-    /// motions, its columns are the samples, and its entries are the sizes of the motions.
+    /// There are two sets of samples, one for each variance factor. The first factor is 1, for samples of the
+    /// posterior. The second factor multiplies the variance of the field, for samples that bound the extremes
+    /// ([`HypothesisSet`]).
     ///
-    /// If `is_between` is true and there are fewer than [`MAX_PLACES`] places, the samples are also evaluated between
-    /// the places ([`IntermediateNodes`]).
+    /// `effects` has one row for each place and one column for each motion. An element is the deviation that one unit
+    /// of the motion causes at the place. `moved` has one matrix for each set of samples, with one row for each motion
+    /// and one column for each sample. An element is the size of the motion.
+    ///
+    /// If `is_between` is true and there are fewer than [`MAX_PLACES`] places, the samples are also evaluated at grid
+    /// nodes between the places ([`IntermediateNodes`]).
     fn evaluate(
         fields: &FieldHypotheses,
         draws: PosteriorSamples,
@@ -796,9 +822,12 @@ impl SampledForms {
         }
     }
 
-    /// Restricts the samples with the second variance factor ([`HypothesisSet`]) to the places near a measured point in
-    /// `touched`. Near means closer than half the typical spacing of the places. At all other places, the measured
-    /// points hardly limit these samples. Therefore they are replaced there by the samples of the posterior.
+    /// Limits the second set of samples to the places near a measured point. The second set has samples of a field with
+    /// an increased variance, which bound the extremes ([`HypothesisSet`]). At places far from all measured points,
+    /// these samples are replaced by the posterior samples, because hardly any measured point limits them there.
+    ///
+    /// `touched` has the positions of the measured points (x and y in mm). A place is near if its distance from a
+    /// measured point is less than half the typical spacing of the places.
     fn rough_where_touched(mut self, touched: &[[f64; 2]]) -> Self {
         let at = |&[x, y]: &[f64; 2]| Point::new(x, y, 0.0);
         let near2 = (0.5 * spacing_mm(&self.places)).powi(2);
@@ -825,15 +854,17 @@ impl SampledForms {
         Self { smooth_sigma_mm, ..self }
     }
 
-    /// Adds form that is too narrow to be resolved to the samples, at the measured points and between them.
+    /// Adds narrow form (form that is too narrow to be resolved) to the samples, at the measured points and at the
+    /// nodes between them.
     ///
-    /// At a measured point, the residual of the smooth form is the sum of probe noise and narrow form. The variance of
-    /// this sum is the noise variance of the sample plus that of the short waves. Each residual is multiplied by the
-    /// share of narrow form in this variance, and then added to the sample. A random number is also added, for the
-    /// uncertainty of this split.
+    /// At a measured point, the residual is the deviation minus the smooth form of the sample. It is the sum of probe
+    /// noise and narrow form. The variance of this sum is the noise variance of the sample plus the variance of the
+    /// waves shorter than the basis functions. Each residual is multiplied by the share (0 to 1) of narrow form in this
+    /// variance, and then added to the sample. A random number is also added, because the split into noise and form is
+    /// uncertain.
     ///
-    /// If the points are too few to separate form from noise ([`is_underdetermined`]), further samples are created in
-    /// which the deviations count entirely as form.
+    /// If the points are too few to separate form from noise ([`is_underdetermined`]), another set of samples is
+    /// created. In this set, the deviations count entirely as form.
     fn with_unresolved_form(mut self, observed: &Observations, posterior: &Posterior, inputs: &ModelInputs) -> Self {
         // The residuals also contain motions and random effects. Neither is noise. Between the touches the samples keep
         // all of their motions.
@@ -903,12 +934,14 @@ impl SampledForms {
         }
     }
 
-    /// Subtracts from each sample a random error of the machine that is ground into the part: the sum of the columns of
-    /// `ground_in`, each times a standard normal random number. Returns the samples unchanged if `ground_in` is `None`.
+    /// Subtracts a random error of the machine from each sample. This error is ground into the part. It is the sum of
+    /// the columns of `ground_in`, each times a standard normal random number. Returns the samples unchanged if
+    /// `ground_in` is `None` or has no column.
     ///
-    /// The points do not show this error. Let E be the columns and t the normal numbers. A part that was corrected by a
-    /// measurement with the error `E t` has the form `f - E t`. The next measurement has the same error, so its
-    /// deviations are `(f - E t) + E t` plus noise, without t.
+    /// The measured points do not show this error. Let f be the form after a correction by a measurement without error.
+    /// Let E be the columns of `ground_in`, and t the normal numbers. A part that was corrected by a measurement with
+    /// the error `E t` has the form `f - E t`. The next measurement has the same error, so its deviations are `(f - E
+    /// t) + E t` plus noise. The error `E t` is not in these deviations.
     fn without_ground_in(mut self, ground_in: Option<&DMatrix<f64>>) -> Self {
         let Some(columns) = ground_in.filter(|columns| columns.ncols() > 0) else { return self };
         let take = |forms: &mut DMatrix<f64>, columns: &DMatrix<f64>| {
@@ -1014,21 +1047,31 @@ impl SampledForms {
         (squares / self.smooth_sigma_mm.len().max(1) as f64).sqrt()
     }
 
-    /// Returns the figures RMS, PV and PV 99.8 % of each sample, in mm. They are computed from the places only, not
-    /// from the nodes between the places. RMS is that of the posterior samples. PV and PV 99.8 % are those of the
-    /// samples with the second variance factor ([`HypothesisSet`]), which bound the extremes.
+    /// Returns the figures RMS, PV and PV 99.8 % (PV without the outermost 0.1 % at either end) of each sample, in mm.
+    /// They are computed from the places only, not from the nodes between the places.
+    ///
+    /// RMS comes from the posterior samples. PV and PV 99.8 % come from the second set of samples, which bounds the
+    /// extremes. In this set, the variance of the field is multiplied by the second variance factor
+    /// ([`HypothesisSet`]).
     fn figures_at_places(&self) -> Vec<[f64; 3]> {
         let [plain, other] = self.forms.each_ref().map(|forms| self.figures_of(forms, None));
         plain.iter().zip(&other).map(|([rms, ..], [_, pv, most])| [*rms, *pv, *most]).collect()
     }
 
-    /// Returns the figures RMS, PV and PV 99.8 % with their credible intervals, in mm.
+    /// Returns the figures RMS, PV and PV 99.8 % (PV without the outermost 0.1 % at either end) with their credible
+    /// intervals, in mm.
     ///
-    /// `least` and `most` have these three figures for each of further samples. The figures in `least` can only lower
-    /// the lower ends of the intervals. The figures in `most` can only raise the upper end of the interval of RMS. For
-    /// PV and PV 99.8 %, the samples with the second variance factor ([`HypothesisSet`]) raise the upper ends instead.
-    /// With fewer than 200 measured points, the lower ends are multiplied by [`FEW_LOW_FACTOR`]. `is_seen` is true if a
-    /// form was detected. If it is false, the lower ends of the intervals are 0.
+    /// The medians and the intervals come from the posterior samples. Other samples can only widen the intervals:
+    ///
+    /// - `least` has the three figures of each of further samples. They can only lower the lower ends.
+    /// - `most` also has the three figures of each of further samples. They can only raise the upper end of RMS.
+    /// - The second set of samples can only raise the upper ends of PV and PV 99.8 %. In this set, the variance of the
+    ///   field is multiplied by the second variance factor ([`HypothesisSet`]).
+    /// - Samples that count the deviations entirely as form, if there are any, can only raise the upper ends of all
+    ///   three.
+    ///
+    /// If the places are measured points and there are fewer than 200, the lower ends are multiplied by
+    /// [`FEW_LOW_FACTOR`]. `is_seen` is true if a form was detected. If it is false, the lower ends are 0.
     fn figures(&self, is_seen: bool, [least, most]: [&[[f64; 3]]; 2], inputs: &ModelInputs) -> FormFigures {
         let [plain, rough] =
             [0, 1].map(|k| self.figures_of(&self.forms[k], self.intermediate.as_ref().map(|of| &of.forms[0])));
@@ -1076,13 +1119,15 @@ fn min_and_max(of: impl Iterator<Item = f64>) -> [f64; 2] {
     of.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
 }
 
-/// Adds form that is too narrow to be resolved to every place of each sample: an independent normal random number with
-/// the variance that [`split_noise`] gives.
+/// Adds narrow form (form that is too narrow to be resolved) to every place of each sample. The narrow form at a place
+/// is an independent normal random number. Its standard deviation is the second result of [`split_noise`].
 ///
-/// `forms` has one matrix for each of the two variance factors ([`HypothesisSet`]), with one column for each sample.
-/// `scatter_mm` has the standard deviation of the noise of each sample. `narrow_mm` has the standard deviation of the
-/// waves shorter than the basis functions, for each variance factor and sample. `stream` is the seed of the random
-/// numbers.
+/// - `forms` has two sets of samples, one for each variance factor ([`HypothesisSet`]). The factor multiplies the
+///   variance of the field. A matrix has one row for each place and one column for each sample.
+/// - `scatter_mm` has the standard deviation of the noise of each sample, in mm.
+/// - `narrow_mm` has the standard deviation of the waves shorter than the basis functions, in mm, for each variance
+///   factor and sample.
+/// - `stream` is the seed of the random numbers.
 fn add_narrow(
     forms: &mut [DMatrix<f64>; 2],
     (scatter_mm, narrow_mm): (&[f64], &[Vec<f64>; 2]),
@@ -1140,15 +1185,18 @@ impl Interval {
         (self.high_mm - self.low_mm) / WIDTH
     }
 
-    /// Builds the credible interval of a figure from `values`, its values in equally probable samples. `values` must
-    /// not be empty.
+    /// Builds the credible interval of a figure from `values`: the value of the figure in each of several equally
+    /// probable samples. `values` must not be empty.
     ///
-    /// Quantiles above the median can only become larger by `higher`: each is the maximum of the quantiles of `values`
-    /// and of every set in `higher`. Quantiles below the median can only become smaller by `lower`: each is the minimum
-    /// of the quantiles of `values` and of `lower`. An empty `lower` is ignored. If `has_low` is false, all quantiles
-    /// below the median are 0.
+    /// `higher` has further sets of values. They can only raise the quantiles above the median: each quantile is the
+    /// maximum of the quantiles of `values` and of every set in `higher`. No set in `higher` may be empty. `lower` is
+    /// one further set of values. It can only lower the quantiles below the median: each quantile is the minimum of the
+    /// quantiles of `values` and of `lower`. An empty `lower` is ignored. If `has_low` is false, all quantiles below
+    /// the median are 0.
     ///
-    /// `inputs` has the probabilities of the bounds for decisions and for acceptance.
+    /// `inputs` gives the probabilities of three bounds. [`ModelInputs::decision_risk`] is the probability that the
+    /// figure is below the bound `least_mm`, and also that it is above the bound `most_mm`.
+    /// [`ModelInputs::acceptance_probability`] is the probability that the figure is below the bound `accepted_mm`.
     pub(super) fn from_samples(
         values: Vec<f64>,
         (lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
@@ -1158,8 +1206,13 @@ impl Interval {
         Self::with_low_factor(values, (lower, higher), (has_low, 1.0), inputs)
     }
 
-    /// Builds the credible interval of a figure from samples, with the parameters and rules of
-    /// [`Interval::from_samples`]. In addition, the quantiles below the median are multiplied by `low_factor`.
+    /// Builds the credible interval of a figure from `values`: the value of the figure in each of several equally
+    /// probable samples. `values` must not be empty.
+    ///
+    /// The sets in `higher` can only raise the quantiles above the median. The set `lower` can only lower the quantiles
+    /// below the median; an empty `lower` is ignored. If `has_low` is true, the quantiles below the median are then
+    /// multiplied by `low_factor`. If `has_low` is false, they are 0. `inputs` gives the probabilities of the bounds,
+    /// as in [`Interval::from_samples`].
     fn with_low_factor(
         mut values: Vec<f64>,
         (mut lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),

@@ -128,8 +128,9 @@ pub(super) struct FieldHypothesis {
     pub(super) prior: Vec<f64>,
 }
 
-/// Returns the variance ratios (variance of the field divided by variance of the noise) at which every field hypothesis
-/// is evaluated. There are [`VARIANCE_RATIOS`] values in ascending order, with equal steps of their logarithm.
+/// Returns the variance ratios at which every field hypothesis (a smoothness and a range of the random field) is
+/// evaluated. A variance ratio is the variance of the field divided by the variance of the noise. There are
+/// [`VARIANCE_RATIOS`] values in ascending order, with equal steps of their logarithm.
 pub(super) fn variance_ratios() -> impl Iterator<Item = f64> {
     let [least, most] = VARIANCE_RATIO_LIMITS.map(f64::ln);
     (0..VARIANCE_RATIOS).map(move |k| (least + (most - least) * k as f64 / (VARIANCE_RATIOS - 1) as f64).exp())
@@ -227,12 +228,13 @@ impl FieldHypotheses {
         (Reduced { rows, pivots: None }, taken)
     }
 
-    /// Computes the whitened basis functions at the points, without their best fit by the fixed effects, in few
-    /// coordinates. Whitening removes the correlation of the noise of successive points.
+    /// Computes the whitened basis functions at the points, after their best fit by the fixed effects is subtracted.
+    /// Whitening removes the correlation of the noise of successive points. The result has reduced coordinates: fewer
+    /// rows than there are points.
     ///
     /// First the products of all pairs of basis functions are summed over the points. The part that the best fit
-    /// removes is subtracted from these sums. A pivoted Cholesky factorization of the result then gives the
-    /// coordinates, until the remaining variance is negligible.
+    /// removes is subtracted from these sums. A pivoted Cholesky factorization of the result then gives one coordinate
+    /// after another, until the remaining variance is negligible.
     ///
     /// Returns the coordinates, and the product Q'W phi with one row for each fixed effect and one column for each
     /// basis function. Here phi are the basis functions at the points, W is the whitening, and Q is an orthonormal base
@@ -290,12 +292,16 @@ impl FieldHypotheses {
         rows
     }
 
-    /// Converts columns of point values, such as deviations, to the reduced coordinates of the basis functions (see
-    /// [`Reduced`]). `columns` has one row for each point. The columns are first whitened, and their best fit by the
-    /// fixed effects is subtracted. Whitening removes the correlation of the noise of successive points.
+    /// Converts columns of point values, such as deviations, to reduced coordinates. `columns` has one row for each
+    /// point. There is one reduced coordinate for each point if the points are few. Otherwise there are fewer
+    /// coordinates than points, but enough to distinguish the basis functions ([`Reduced`]).
     ///
-    /// Returns two results. The first has one row for each coordinate and one column for each column of `columns`. The
-    /// second has the products of all pairs of the columns, summed over the points, after the subtraction.
+    /// The columns are first whitened, which removes the correlation of the noise of successive points. Then their best
+    /// fit by the fixed effects is subtracted.
+    ///
+    /// Returns two results. The first has one row for each reduced coordinate and one column for each column of
+    /// `columns`. The second has the products of all pairs of the columns, summed over the points, after the
+    /// subtraction.
     pub(super) fn coordinates(&self, columns: &DMatrix<f64>) -> (Mat<f64>, DMatrix<f64>) {
         let mut columns = whitened(&self.whitening, columns);
         let taken = &self.base * self.base.tr_mul(&columns);
@@ -366,11 +372,15 @@ impl FieldHypotheses {
         })
     }
 
-    /// Multiplies `coordinates` by D C'. The matrix C has the basis functions in the reduced coordinates of the points
-    /// ([`Reduced::rows`]). D is the diagonal matrix of the standard deviations of the coefficients in `node`.
+    /// Maps values in reduced coordinates to coefficients of the basis functions. There is one reduced coordinate for
+    /// each point if the points are few. Otherwise there are fewer coordinates than points, but enough to distinguish
+    /// the basis functions ([`Reduced`]).
     ///
-    /// `coordinates` has one row for each reduced coordinate. Returns one row for each basis function of `node`, and
-    /// one column for each column of `coordinates`.
+    /// Returns D C' times `coordinates`. C has the basis functions in the reduced coordinates ([`Reduced::rows`]). D is
+    /// the diagonal matrix of the standard deviations of the coefficients in `node`.
+    ///
+    /// `coordinates` has one row for each reduced coordinate. The result has one row for each basis function of `node`,
+    /// and one column for each column of `coordinates`.
     pub(super) fn coefficients_from(&self, node: &FieldHypothesis, coordinates: &Mat<f64>) -> Mat<f64> {
         let c = node.standard_deviations.len();
         let mut coefficients = self.reduced.rows.subcols(0, c).transpose() * coordinates;
@@ -384,12 +394,15 @@ impl FieldHypotheses {
         coefficients
     }
 
-    /// Multiplies `coefficients` by C D. The matrix C has the basis functions in the reduced coordinates of the points
-    /// ([`Reduced::rows`]). D is the diagonal matrix of the standard deviations of the coefficients in `node`. Each
-    /// coefficient is given in units of its standard deviation.
+    /// Maps coefficients of the basis functions to values in reduced coordinates. There is one reduced coordinate for
+    /// each point if the points are few. Otherwise there are fewer coordinates than points, but enough to distinguish
+    /// the basis functions ([`Reduced`]).
     ///
-    /// `coefficients` has one row for each basis function of `node`. Returns one row for each reduced coordinate, and
-    /// one column for each column of `coefficients`.
+    /// Returns C D times `coefficients`. C has the basis functions in the reduced coordinates ([`Reduced::rows`]). D is
+    /// the diagonal matrix of the standard deviations of the coefficients in `node`.
+    ///
+    /// `coefficients` has one row for each basis function of `node`. Each coefficient is in units of its standard
+    /// deviation. The result has one row for each reduced coordinate, and one column for each column of `coefficients`.
     pub(super) fn coordinates_from(&self, node: &FieldHypothesis, coefficients: &Mat<f64>) -> Mat<f64> {
         let c = node.standard_deviations.len();
         let strong = Mat::from_fn(c, coefficients.ncols(), |r, k| node.standard_deviations[r] * coefficients[(r, k)]);
@@ -408,13 +421,17 @@ impl FieldHypotheses {
         self.base.tr_mul(&whitened(&self.whitening, columns))
     }
 
-    /// Returns the matrix that maps coefficients of the basis functions to whitened observations. Each coefficient is
-    /// in units of its standard deviation in `node`. D is the diagonal matrix of these standard deviations.
+    /// Returns the matrix that maps coefficients of the basis functions to whitened observations. Whitening removes the
+    /// correlation of the noise of successive points. Each coefficient is in units of its standard deviation in `node`.
+    /// The matrix has one column for each basis function of `node`.
     ///
-    /// The first rows of the matrix are C D, with one row for each reduced coordinate (C is [`Reduced::rows`]). Then
-    /// follow the rows Q'W phi D, one for each fixed effect. They have the part of the basis functions phi that the
-    /// best fit of the fixed effects removes. W is the whitening, and Q is an orthonormal base of the whitened fixed
-    /// effects.
+    /// The first rows are C D, one for each reduced coordinate. C has the basis functions in the reduced coordinates,
+    /// after their best fit by the fixed effects is subtracted ([`Reduced::rows`]). D is the diagonal matrix of the
+    /// standard deviations of the coefficients.
+    ///
+    /// Then follow the rows Q'W phi D, one for each fixed effect. They have the part of the basis functions that the
+    /// best fit removes. Here phi are the basis functions at the points, W is the whitening, and Q is an orthonormal
+    /// base of the whitened fixed effects.
     pub(super) fn with_effects(&self, node: &FieldHypothesis) -> Mat<f64> {
         let (r, p) = (self.reduced.rows.nrows(), self.removed_by_fit.nrows());
         Mat::from_fn(r + p, node.standard_deviations.len(), |k, wave| {
@@ -447,13 +464,16 @@ impl FieldHypotheses {
 /// smoothness with one range). tau is the variance of the field divided by the variance of the noise. The order is that
 /// of [`variance_ratios`].
 ///
-/// `values` are the eigenvalues of the node. `narrow` is the variance of waves shorter than the basis functions.
-/// `scale` is [`FieldHypothesis::scale`]. `free` is n - p, the number of points minus the number of fixed effects.
+/// - `values` are the eigenvalues of the node.
+/// - `narrow` is the variance of the waves shorter than the basis functions, in a field of variance 1.
+/// - `scale` is the factor that converts tau s^2 to the variance of the field, where s is the standard deviation of the
+///   noise ([`FieldHypothesis::scale`]).
+/// - `free` is n - p, the number of points minus the number of fixed effects.
 ///
 /// The prior is J / (1 + J), where J^2 is the Fisher information on ln tau (a bounded Jeffreys prior). Let l = scale
 /// (eigenvalue + narrow) and q = l tau / (1 + l tau). Then J^2 = (sum q^2 - (sum q)^2 / (n - p)) / 2. The sums have n -
-/// p terms: the eigenvalues in `values`, and 0 for all others. A field that cannot be distinguished from noise has J =
-/// 0.
+/// p terms. Terms beyond the number of `values` have the eigenvalue 0. A field that cannot be distinguished from noise
+/// has J = 0.
 fn log_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
     let of = |tau: f64| {
         let share = |l: f64| l * tau / (1.0 + l * tau);

@@ -61,7 +61,8 @@ struct PlaceBlock {
 /// fixed effects, then the random effects.
 ///
 /// Each random effect is divided by the prior standard deviation of the fixed effects. So one common prior variance
-/// applies to fixed and random effects. `hyperparameters` gives the standard deviation of the field for this.
+/// applies to fixed and random effects. The prior standard deviation of the fixed effects is [`FIXED_EFFECT_SIGMAS`]
+/// times the standard deviation of the field in `hyperparameters`.
 ///
 /// # Errors
 /// Returns [`ModelError::Shape`] if the numbers of rows differ, or [`ModelError::NotFinite`] if a number is not finite.

@@ -144,11 +144,12 @@ impl CompositeLikelihood {
     }
 
     /// Finds the most likely noise autocorrelation for an isotropic field. `plain` is the maximum of the log-likelihood
-    /// without autocorrelation.
+    /// without autocorrelation. Returns the kind of noise with the autocorrelation found, and the maximum of the
+    /// log-likelihood for this kind.
     ///
-    /// Returns the kind of noise with this autocorrelation, and the maximum of the log-likelihood for this kind.
-    /// Returns `None` if, for the start values of the search, this maximum is less than
-    /// [`MIN_AUTOCORRELATION_EVIDENCE`] above that of `plain`.
+    /// The search first tries the fixed values [`START_AUTOCORRELATIONS`], then refines the best of them. Returns
+    /// `None` if the best fixed value raises the maximum of the log-likelihood by less than
+    /// [`MIN_AUTOCORRELATION_EVIDENCE`], compared with `plain`.
     fn most_likely_autocorrelation(&self, plain: Maximum) -> Option<(NoiseKind, Maximum)> {
         let of = |drift: f64| NoiseKind { autocorrelation: drift, ..NoiseKind::PLAIN };
         let mut best = (0.0, plain);

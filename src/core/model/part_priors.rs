@@ -127,9 +127,12 @@ impl PartFit {
         })
     }
 
-    /// Returns the prior of the field of the next part: a median and a factor for the range, and for the ratio of noise
-    /// to field. A factor is one standard deviation of the logarithm. The medians are those of the earlier parts. The
-    /// factors cover the differences between parts. They are larger if the statistics have few parts, and at least 2.
+    /// Returns the prior of the field of the next part. The prior has a median and a factor for the range, and a median
+    /// and a factor for the ratio of noise to field (standard deviations). The natural logarithm of a factor is one
+    /// standard deviation of the logarithm of the value.
+    ///
+    /// The medians are those of the earlier parts. The factors cover the differences between parts. A factor is at
+    /// least 2. With few parts in the statistics, the uncertainty of their median makes the factors larger.
     pub fn prior(&self) -> Prior {
         let n = f64::from(self.parts.max(1));
         let expected = |[median, factor]: [f64; 2]| {

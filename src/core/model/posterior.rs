@@ -28,12 +28,13 @@ const LOWER_BOUND_VARIANCE_FACTOR: f64 = 1.0 / 4.0;
 /// logarithm). Used for the pose and for the hyperparameters.
 const STRONGER: f64 = 3.0;
 
-/// Prepares the field hypotheses for the more likely of two kinds of noise: with or without autocorrelation. The kinds
-/// are compared by their marginal likelihood from all points. If the points give too little evidence for an
-/// autocorrelation ([`candidates`]), only the kind without it is used.
+/// Prepares the field hypotheses for the more likely of two kinds of noise: with or without autocorrelation. A field
+/// hypothesis is a smoothness with a range of the random field. The two kinds are compared by their marginal likelihood
+/// from all points. If the points give too little evidence for an autocorrelation ([`candidates`]), only the kind
+/// without autocorrelation is used.
 ///
-/// The likelihood of neighbouring points alone can mistake waves across the path for autocorrelation along the path.
-/// Therefore all points are used for the comparison.
+/// All points are used for this reason: a comparison with neighbouring points alone can fail. Waves of the form across
+/// the path of the probe then look like autocorrelation along the path.
 ///
 /// # Errors
 /// Returns the errors of [`FieldHypotheses::over`].
@@ -94,10 +95,13 @@ impl HypothesisSet {
         }
     }
 
-    /// Returns the two factors that multiply the variance of a field with the given smoothness when samples are drawn.
-    /// The first factor is 1, for samples of the posterior itself. The second factor is for the samples that give
-    /// bounds of extreme values, such as the maximum of the form. It is below 1 for the set `Smooth`, and above 1 for
-    /// the others.
+    /// Returns the two variance factors for sampling from a field with the given smoothness. A variance factor
+    /// multiplies the variance of the field.
+    ///
+    /// The first factor is 1, for samples of the posterior. The second factor is for samples that bound extreme values,
+    /// such as the maximum of the form. For the set `Smooth`, the second factor is [`LOWER_BOUND_VARIANCE_FACTOR`],
+    /// below 1. For the sets `All` and `Rough`, it is above 1: [`UPPER_BOUND_VARIANCE_FACTOR_ROUGH`] if the field is
+    /// rough ([`Smoothness::Exponential`]), otherwise [`UPPER_BOUND_VARIANCE_FACTOR`].
     fn variance_factors(self, smoothness: Smoothness) -> [f64; 2] {
         match self {
             Self::Smooth => [1.0, LOWER_BOUND_VARIANCE_FACTOR],
@@ -330,9 +334,12 @@ impl<'f> Posterior<'f> {
         Hyperparameters { field, noise_sigma_mm: mean(|of| of.noise_sigma_mm), ..first }
     }
 
-    /// Draws `count` samples from the posterior. Only fields in the set `which` are used. A sample has the coefficients
-    /// of the basis functions, the standard deviation of the noise, and the random effects. The same `seed` gives the
-    /// same samples. The result is empty if the set has no field.
+    /// Draws `count` samples from the posterior. `which` selects the fields: all, only the smooth ones, or only the
+    /// rough ones. A sample has the coefficients of the basis functions for each of two variance factors, the standard
+    /// deviation of the noise in mm, and the random effects in units of their standard uncertainties. A variance factor
+    /// multiplies the variance of the field ([`HypothesisSet`]).
+    ///
+    /// The same `seed` gives the same samples. The result is empty if the set has no field.
     pub(super) fn samples(&self, which: HypothesisSet, count: usize, seed: u64) -> PosteriorSamples {
         let probabilities = self.probabilities(which);
         // Equal steps through the cumulative probability: the count of each field is within one of its expected value.
@@ -376,9 +383,14 @@ impl<'f> Posterior<'f> {
         draws
     }
 
-    /// Draws posterior samples for one node (smoothness with range). `number` is the index of this node. `chosen` has
-    /// one entry for each sample: the node, the variance ratio of field to noise, and the number of the sample. The
-    /// number of the sample and `seed` select the sequence of random numbers. `which` selects the two variance factors.
+    /// Draws posterior samples for one node (smoothness with range). Returns the samples in the order of `chosen`.
+    ///
+    /// - `number` is the index of the node.
+    /// - `chosen` has one entry for each sample: the index of the node, the variance ratio of field to noise, and the
+    ///   number of the sample.
+    /// - `seed` and the number of the sample select the sequence of random numbers.
+    /// - `which` is the set of fields. It selects two variance factors, which multiply the variance of the field.
+    ///   Coefficients are drawn for each of the two factors.
     ///
     /// First a sample z0 of the prior is drawn. Then z0 is corrected so that its projections on the eigenvectors of the
     /// node get values drawn from the posterior (Matheron's rule).

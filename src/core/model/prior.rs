@@ -41,8 +41,10 @@ impl Prior {
     /// `ratio` is the standard deviation of the noise divided by that of the field.
     ///
     /// The density is a mixture of two priors: this prior, and a wider prior with a small weight. The wider prior is
-    /// for parts that resemble no earlier part (robust prior, Schmidli and others 2014). Each prior falls like a normal
-    /// density of the logarithm up to one factor from the median, and only exponentially beyond (Huber 1964).
+    /// for parts that resemble no earlier part (robust prior, Schmidli and others 2014).
+    ///
+    /// Each prior has a median and a factor. From median / factor to median x factor, the density is normal in the
+    /// logarithm of the value. Beyond these limits, it falls only exponentially (Huber 1964).
     pub(super) fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
         let of = |value: f64, median: f64, factor: f64| {
             let off = ((value / median).ln() / factor.ln()).abs();

@@ -157,12 +157,16 @@ impl Sessions {
         })
     }
 
-    /// Searches the most probable hyperparameters. The search starts at the best of several start values. It alternates
-    /// between the hyperparameters of the common field with the noise, and those of the field of a session. `priors` is
-    /// the prior of the common field.
+    /// Searches the most probable hyperparameters. `priors` is the prior of the common field. The search starts at the
+    /// best of several start values. It alternates between two pairs of hyperparameters.
     ///
-    /// Returns the maximum as the two pairs of logarithms that [`Self::scaled`] takes, and the logarithm of the
-    /// posterior density at the maximum.
+    /// Returns the two pairs at the maximum, as natural logarithms, and the logarithm of the posterior density at the
+    /// maximum:
+    ///
+    /// - The first pair is the range of the common field in mm, and the standard deviation of the noise divided by that
+    ///   of the common field.
+    /// - The second pair is the standard deviation of the field of a session divided by that of the common field, and
+    ///   the range of the field of a session in mm.
     fn search_maximum(&self, priors: &Prior) -> ([[f64; 2]; 2], f64) {
         let height = |at| self.scaled(at, priors).map_or(f64::NEG_INFINITY, |(_, _, value)| value);
         let [median_mm, _] = priors.range_mm;
@@ -345,7 +349,8 @@ impl BestFitBasis {
         Self { q: orthonormal_base(effects.clone()) }
     }
 
-    /// Returns `values` minus their least-squares fit by the effects. `values` has one value for each point.
+    /// Returns `values` minus their least-squares fit by the effects (for example motions of the part) of this basis.
+    /// `values` has one value for each point.
     fn after_best_fit(&self, values: &[f64]) -> Vec<f64> {
         let taken = self.q.tr_mul(&nalgebra::DVector::from_column_slice(values));
         let fitted = &self.q * taken;
@@ -358,9 +363,9 @@ impl BestFitBasis {
         1.0 - self.q.row(point).norm_squared()
     }
 
-    /// Returns the variance of the value at each point after the best fit by the effects. `covariance` is the
-    /// covariance matrix V of the values before the fit. The result is the diagonal of P V P, where P is the projection
-    /// that removes the effects.
+    /// Returns the variance of the value at each point, after the best fit by the effects (for example motions of the
+    /// part) is subtracted. `covariance` is the covariance matrix V of the values before the subtraction. The result is
+    /// the diagonal of P V P, where P is the projection that removes the effects.
     fn variances_after(&self, covariance: &Mat<f64>) -> Vec<f64> {
         let (n, p) = self.q.shape();
         let q = Mat::from_fn(n, p, |r, c| self.q[(r, c)]);

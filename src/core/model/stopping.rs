@@ -287,9 +287,11 @@ impl ExpectedTouches {
         off.chain(self.outliers.iter().copied())
     }
 
-    /// Returns the indices of the untried targets next to outliers, in ascending order and without duplicates. An
-    /// outlier is skipped if at least [`MIN_TRIED_NEIGHBOURS`] of its nearest targets were tried. `so_far` has the
-    /// targets and says which of them were tried.
+    /// Returns the indices of untried targets near outliers, in ascending order and without duplicates. A target is
+    /// tried if a batch of touches has already included it. Near means among the [`NEIGHBOURS`] targets that are
+    /// nearest to the outlier. `so_far` has all targets, and the batch in which each target was tried.
+    ///
+    /// An outlier is skipped if at least [`MIN_TRIED_NEIGHBOURS`] of these nearest targets were tried.
     fn untried_neighbours(&self, so_far: &PartialMeasurement) -> Vec<usize> {
         let mut around = Vec::new();
         for target in self.all_outliers() {
@@ -312,12 +314,15 @@ impl ExpectedTouches {
     }
 
     /// Chooses the targets to touch next, and returns their indices. Only targets that were not tried yet are chosen.
-    /// The number of chosen targets is `wanted`. It is larger if `around` alone has more untried targets, and smaller
-    /// if fewer untried targets exist.
+    /// `wanted` is the number of targets to choose. More are chosen if `around` alone has more untried targets. Fewer
+    /// are chosen if fewer untried targets exist.
     ///
-    /// The targets are chosen in three steps. First come the targets `around`, the neighbours of outliers. Then come
-    /// random targets, which `seed` selects. Last come the targets with the largest weighted posterior variance
-    /// ([`Self::max_variance_target`]). For this variance, every target that is already chosen counts as touched.
+    /// The targets are chosen in three steps:
+    ///
+    /// - All untried targets in `around`. These are the neighbours of outliers.
+    /// - Random targets. `seed` selects them.
+    /// - The targets with the largest posterior variance. The variance counts twice at targets where the maximum or the
+    ///   minimum of the form can lie ([`Self::max_variance_target`]). Targets that are already chosen count as touched.
     ///
     /// # Errors
     /// Returns [`ModelError::NotDefinite`] if the covariance of the touches is not positive definite.

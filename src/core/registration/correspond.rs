@@ -154,9 +154,12 @@ impl ProjectionPass<'_> {
         sums
     }
 
-    /// Returns the facets at which the projection of four points starts: the facets of their last projections. If one
-    /// of these facets is unknown, all four are extrapolated from `recent`, the facets of the eight points before.
-    /// Returns `None` if this extrapolation is not possible ([`OffsetSurface::extrapolate_x4`]).
+    /// Returns the facets at which the projection of four points starts. These are the facets in `correspondences`,
+    /// from the last projections of the four points.
+    ///
+    /// If one of these facets is unknown, all four are extrapolated from `recent`: the facets of the eight preceding
+    /// points. Returns `None` if the extrapolation is not possible. This is so on a mesh, or if a facet of the four
+    /// directly preceding points is unknown ([`OffsetSurface::extrapolate_x4`]).
     #[inline(always)]
     fn start(
         &self,
@@ -171,11 +174,12 @@ impl ProjectionPass<'_> {
         self.surface.extrapolate_x4(&recent[0], &recent[1])
     }
 
-    /// Projects four points together onto the surface. Each search starts at the facet of the point in `places`.
-    /// Updates the four `correspondences`, and adds the points that are in the fit to `sums`.
+    /// Projects four measured points together onto the surface. `places` has the start facet of the search for each
+    /// point. Updates the facet, the distance and the distance beyond the edge in the four `correspondences`. Adds the
+    /// points that are in the fit to `sums`.
     ///
-    /// Returns true if all four were projected. Returns false and changes nothing if one of the points is beyond the
-    /// edge or too far from its start facet.
+    /// Returns true if all four points were projected. Returns false and changes nothing if one of the points is beyond
+    /// the edge or too far from its start facet.
     #[inline(always)]
     fn project_x4(
         &self,
@@ -221,11 +225,12 @@ impl ProjectionPass<'_> {
     }
 }
 
-/// Returns the distance of a projection beyond the edge of the surface, in steps of the nominal sampling; 0 on the
-/// part. `foot` is the projection of the point `p` onto the surface.
+/// Returns the distance of a projection beyond the edge of the surface, in steps of the nominal sampling. Returns 0 if
+/// the projection is on the part. `p` is the centre of the ball of the probe, in the model frame. `foot` is the
+/// projection of `p` onto the surface.
 ///
-/// If the contact point of `p` lies outside the outline of the part, returns at least 1. The reason: the nominal points
-/// can extend beyond the outline.
+/// Returns at least 1 if the contact point (where the ball touches the part) lies outside the outline of the part. The
+/// reason: the nominal points can extend beyond the outline.
 pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &PointProjection) -> f32 {
     let is_outside = surface.nominal().outline().is_some_and(|outline| {
         let contact = p - foot.normal * (foot.distance_mm + surface.radius_mm());
@@ -262,9 +267,11 @@ pub(crate) trait ProjectionReporter: Sync {
     /// Initial value of an item.
     const BLANK: Self::Item;
 
-    /// Converts four measured points to the four items to report. `correspondences` has the state of each point, such
-    /// as its facet and whether it is in the fit. `at` has the final projections of the points. The function must be
-    /// inlined, so that it is compiled with the vector instructions of its caller.
+    /// Converts four measured points to four items. An item is the result of one point in the report of the
+    /// registration. `correspondences` has the state of each point, such as its facet and whether the point is in the
+    /// fit. `at` has the points in the model frame and their final projections.
+    ///
+    /// The function must be inlined, so that it is compiled with the vector instructions of its caller.
     fn report_x4(&self, correspondences: [&Correspondence; LANES], at: &FinalProjectionX4) -> [Self::Item; LANES];
 }
 
@@ -320,7 +327,8 @@ struct FinalBlock<'a, R> {
 impl<R: ProjectionReporter> pulp::NullaryFnOnce for FinalBlock<'_, R> {
     type Output = [[R::Item; LANES]; GROUPS_PER_TASK];
 
-    /// Returns the items to report for the points of the block, in groups of four.
+    /// Returns the results to report for one block of successive points: [`GROUPS_PER_TASK`] groups of four points,
+    /// with one item for each point. In the last block, the last point of the list is repeated to fill the block.
     #[inline(always)]
     fn call(self) -> Self::Output {
         let mut items = [[R::BLANK; LANES]; GROUPS_PER_TASK];
@@ -332,8 +340,9 @@ impl<R: ProjectionReporter> pulp::NullaryFnOnce for FinalBlock<'_, R> {
 }
 
 impl<R: ProjectionReporter> FinalPass<'_, R> {
-    /// Returns the items to report for four successive points. `first` is the index of the first of them. If fewer than
-    /// four points are left, the last point of the list is repeated.
+    /// Projects four successive points onto the surface and returns the results to report, one item for each point.
+    /// `first` is the index of the first of the four points. If fewer than four points are left, the last point of the
+    /// list is repeated.
     #[inline(always)]
     fn report_group(&self, first: usize) -> [R::Item; LANES] {
         let end = self.measured.len() - 1;
@@ -355,9 +364,11 @@ impl<R: ProjectionReporter> FinalPass<'_, R> {
         )
     }
 
-    /// Projects four points one by one onto the surface. Each search starts at the facet of the last projection of the
-    /// point. `centre` has the four points in the model frame. Each of the four lanes (elements of a vector register)
-    /// of `centre` and of the result holds one point.
+    /// Projects four points one by one onto the surface. Returns the distance in mm and the unit normal of each
+    /// projection. `centre` has the four points in the model frame. `correspondences` has the facet of the last
+    /// projection of each point; each search starts at this facet.
+    ///
+    /// In `centre` and in the result, each of the four lanes (elements of a vector register) holds one point.
     #[cold]
     fn project_individually(&self, centre: &Vector3x4, correspondences: [&Correspondence; LANES]) -> ProjectionX4 {
         let foot = |l: usize| {

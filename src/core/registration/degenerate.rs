@@ -52,9 +52,16 @@ struct ScanLine {
 }
 
 impl ScanLine {
-    /// Returns the line, straight or bent, that the points follow; `None` if they spread over an area. Sorts the points
-    /// along their longest principal axis, and compares the length of the path through them with their extent. Points
-    /// that spread over an area go to and fro across the axis, so that their path is long.
+    /// Returns the line, straight or bent, along which the points follow each other: its direction, its width, and the
+    /// mean distance from point to point in mm. Returns `None` if the points spread over an area, or if there are no
+    /// points.
+    ///
+    /// The points are sorted along their longest principal axis, and joined to a path in this order. The points spread
+    /// over an area in two cases:
+    ///
+    /// - The path is more than twice as long as the extent of the points along the axis, because it goes to and fro.
+    /// - The width exceeds a fifth of this extent. The width is twice the median distance of a point from the straight
+    ///   line through the points before and after it.
     fn detect(mut points: Vec<Point>) -> Option<Self> {
         let (middle, axes) = centroid_and_axes(points.iter().copied());
         let axis: Vector = axes.column(2).into();

@@ -29,11 +29,12 @@ const MIN_HEIGHT_SHARE: f64 = 0.1;
 /// measured from the surface. It is larger because a neighbour on a hump is above the surface too.
 const MIN_SURFACE_HEIGHT_SHARE: f64 = 0.25;
 
-/// Changes an outlier into an inlier if a near neighbour deviates to the same side of the surface. Such a deviation is
-/// form of the part, not a faulty touch. All outliers are examined.
+/// Changes the status of confirmed outliers to inlier. An outlier is confirmed if a close neighbour deviates to the
+/// same side of the surface: the deviation is then a form error of the part, and not a faulty touch.
 ///
-/// Updates `verdict` for the new inliers: their number, the objective, the RMS and the PV. Changes nothing if no
-/// outlier is confirmed. `outlier_sigmas` is the limit for an outlier, in robust standard deviations of the deviations.
+/// Examines all outliers. Updates `verdict`, the quality of the registration, for the new inliers: number of inliers,
+/// objective, RMS and PV. Changes nothing if no outlier is confirmed. `outlier_sigmas` is the limit for an outlier, in
+/// robust standard deviations of the deviations.
 pub(super) fn count_confirmed_outliers(
     deviations: &mut [Deviation],
     verdict: &mut RegistrationQuality,
@@ -110,9 +111,16 @@ impl NeighbourIndex {
         }
     }
 
-    /// Returns true if no neighbour confirms the deviation of the measured point with the index `k`. This is so if the
-    /// point deviates from the median of its neighbours by more than half the limit for an outlier, and no near
-    /// neighbour deviates to the same side. Also returns true if the point is off the part or has no neighbours.
+    /// Returns true if no neighbour confirms the deviation of the measured point with the index `k`. For this, two
+    /// conditions must hold:
+    ///
+    /// - The deviation of the point differs from the median deviation of its eight neighbours by more than half the
+    ///   limit for an outlier.
+    /// - No close neighbour deviates clearly to the same side. A neighbour is close if it is at most 1.5 times as far
+    ///   away as the third nearest neighbour.
+    ///
+    /// Touches at nearly the same place as the point are not neighbours. Also returns true if the point is off the part
+    /// or has no neighbours.
     fn is_isolated(&self, k: usize) -> bool {
         let Ok(own) = self.indices.binary_search(&k) else { return true };
         let near: Vec<(usize, f64)> = self

@@ -171,9 +171,14 @@ impl Problem<'_> {
         Ok(BallStep { scaled: m, length: m.norm(), predicted_decrease_mm2: 2.0 * m.dot(&right), rank })
     }
 
-    /// Returns true if the pose counts as the minimum, so that `step` is not tried. This is so if the step is zero
-    /// except for rounding, if the objective is 0, or if the predicted decrease of the objective is negligible. The
-    /// last rule does not apply to the first step of a registration (`is_first`).
+    /// Returns true if the current pose counts as the minimum, so that `step` is not tried. `sums` are the normal
+    /// equations at this pose. There are three cases:
+    ///
+    /// - The step is zero except for rounding.
+    /// - The objective is 0.
+    /// - The predicted decrease of the objective is at most 1 % of `tolerance` (the relative decrease at which the
+    ///   iteration stops) times the objective. This case does not apply to the first step of a registration
+    ///   (`is_first`).
     fn is_at_minimum(&self, step: &BallStep, sums: &Sums, is_first: bool) -> bool {
         let little =
             !is_first && step.predicted_decrease_mm2 <= MIN_DECREASE_SHARE * self.tolerance * sums.objective_mm2;
@@ -186,16 +191,22 @@ impl Problem<'_> {
         Scaling { centre: pose.inverse().transform_point(&self.centroid), size_mm: self.size_mm }
     }
 
-    /// Projects all points under a pose, updates `correspondences`, and returns the normal equations of the step from
-    /// this pose.
+    /// Projects all measured points onto the surface under `pose`, and stores the projections in `correspondences`, one
+    /// per point. Returns the normal equations of the next step from this pose.
+    ///
+    /// `scaling` defines the coordinates of the step: translations in units of the rms size of the points, rotations
+    /// about their centroid in radians.
     pub(crate) fn project_all(&self, correspondences: &mut [Correspondence], pose: &Pose, scaling: &Scaling) -> Sums {
         correspond(&self.surface, &self.residual, self.measured, correspondences, pose, scaling)
     }
 }
 
-/// Returns the orthogonal projector onto the steps that do not move the `locked` coordinates of the pose. The projector
-/// acts on steps in the scaled coordinates of `scaling`. `locked` is in the order x, y, z, rx, ry, rz of the model
-/// frame; true means locked.
+/// Returns the 6x6 matrix of the orthogonal projection that removes from a step every motion of the `locked`
+/// coordinates of the pose. The six flags in `locked` are in the order x, y, z, rx, ry, rz of the model frame; true
+/// means locked.
+///
+/// The step is in scaled coordinates: three translations in units of the rms size of the points, then three rotations
+/// about their centroid in radians. `scaling` contains the rms size and the centroid.
 pub(crate) fn free_projector(locked: &[bool; 6], scaling: &Scaling) -> Matrix6<f64> {
     let to_twist = scaling.to_twist();
     let mut projector = Matrix6::identity();

@@ -37,8 +37,8 @@ pub struct MapLimits {
 }
 
 impl Default for MapLimits {
-    /// Returns the default limits: coverage factor 2, an error of the map of 10 % of the rms, and a lateral error of 1
-    /// mm.
+    /// Returns the default limits for a map of the deviations. The coverage factor is 2. The lateral error of the map
+    /// (along the surface) may cause an error of 10 % of the rms deviation. The lateral error itself may be 1 mm.
     fn default() -> Self {
         Self { coverage_factor: 2.0, max_error_share: 0.1, max_lateral_mm: 1.0 }
     }
@@ -76,8 +76,12 @@ pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_f
 /// Returns a message that explains why the registration `found` must not be used for a map of the deviations. Returns
 /// `None` if a map is allowed.
 ///
-/// A map is not allowed in two cases. Its lateral error (along the surface) exceeds `limits.max_lateral_mm`. Or the
-/// error of the map that the lateral error causes exceeds `limits.max_error_share` times the rms deviation.
+/// A map is not allowed in two cases:
+///
+/// - The lateral error of the map (its displacement along the surface) exceeds `limits.max_lateral_mm`.
+/// - The lateral error makes the values of the map wrong by more than `limits.max_error_share` (0 to 1) times the rms
+///   deviation.
+///
 /// `covariance` is the covariance of the twist of the pose, in mm and radians (see [`lateral_error`]).
 pub fn map_obstacle(found: &Registration, covariance: &Matrix6<f64>, limits: &MapLimits) -> Option<String> {
     let LateralError { lateral_mm, slope, error_mm } = lateral_error(found, covariance, limits.coverage_factor);
@@ -119,8 +123,12 @@ fn lateral_sigma(c: &Matrix6<f64>, deviation: &Deviation) -> f64 {
     (0.5 * (seen + seen.transpose())).symmetric_eigenvalues().max().max(0.0).sqrt()
 }
 
-/// Groups the deviations into patches of about nine points, and returns the slope between neighbouring patches in mm
-/// per mm: the 95 % quantile over all pairs. Returns 0 if there are no neighbouring patches.
+/// Returns the slope of the deviations along the surface, in mm per mm. Groups the points `used` into patches (cubes in
+/// space) of about nine points, and takes the mean deviation of each patch. The slope between two neighbouring patches
+/// is the difference of their mean deviations divided by their distance.
+///
+/// The result is the 95 % quantile of the absolute slopes of all pairs of neighbouring patches. Returns 0 if there are
+/// no such pairs.
 fn slope(used: &[&Deviation]) -> f64 {
     let n = used.len() as f64;
     let middle = used.iter().map(|d| d.point.coords).sum::<Vector>() / n;

@@ -27,8 +27,9 @@ impl Scaling {
         Twist::new(v.x, v.y, v.z, omega.x, omega.y, omega.z)
     }
 
-    /// Returns the 6x6 matrix that maps scaled coordinates of a step to a twist in the model frame, see
-    /// [`Self::twist`].
+    /// Returns the 6x6 matrix that converts a step in scaled coordinates to a twist in the model frame, in mm and
+    /// radians. The scaled coordinates are three translations in units of `size_mm`, then three rotations about
+    /// `centre` in radians. [`Self::twist`] converts one step.
     pub(crate) fn to_twist(self) -> Matrix6<f64> {
         Matrix6::from_columns(&std::array::from_fn::<_, 6, _>(|k| {
             let mut unit = Vector6::zeros();
@@ -38,8 +39,11 @@ impl Scaling {
     }
 
     /// Returns the row of the Jacobian A for the point `p`, eq. (12) of the paper. `normal` is the unit normal of the
-    /// surface at the projection of `p`. The six elements are the decrease of the distance of the point from the
-    /// surface, in mm, for each scaled coordinate of the step. Point and normal are in the model frame.
+    /// surface at the projection of `p`. Point and normal are in the model frame.
+    ///
+    /// Element k is the decrease of the distance of the point from the surface, in mm, per unit of coordinate k of the
+    /// step. The six coordinates are three translations in units of `size_mm`, then three rotations about `centre` in
+    /// radians.
     #[inline]
     pub(crate) fn row(&self, p: &Point, normal: &Vector) -> [f64; 6] {
         let arm = (p - self.centre).cross(normal);
@@ -147,8 +151,8 @@ impl Sums {
         self.points += 1;
     }
 
-    /// Returns these sums plus `other`. Callers merge in a fixed order, so that the result does not depend on the
-    /// number of threads.
+    /// Returns the normal equations, the objective and the number of points, added from `self` and `other`. Callers
+    /// merge in a fixed order, so that the result does not depend on the number of threads.
     pub(crate) fn merge(mut self, other: &Self) -> Self {
         for (a, b) in self.gram.iter_mut().zip(&other.gram) {
             *a += b;

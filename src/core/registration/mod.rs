@@ -58,14 +58,20 @@ use start::{InitialPose, detect_mirror_image, free_rms, initial_pose, mirrored_r
 /// Registers measured points to a nominal surface. Returns the pose, the deviation of each point, and the quality of
 /// the fit.
 ///
-/// Shapes: measured points in any order, at least one more than there are free directions; one deviation per point, in
-/// the same order. Frames: the points are in the CMM frame, the surface in the model frame. The pose maps the model
-/// frame to the CMM frame. Units: millimetres. Equations: (3), (7) to (15) of the paper.
+/// Shapes: measured points in any order, at least one more than there are free coordinates of the pose; one deviation
+/// per point, in the same order. Frames: the points are in the CMM frame, the surface in the model frame. The pose maps
+/// the model frame to the CMM frame. Units: millimetres. Equations: (3), (7) to (15) of the paper.
 ///
 /// # Errors
-/// Returns an error if the points are too few, repeated, on one line, not finite or of the wrong size, or if the probe
-/// radius is wrong for the surface. Returns an error if the points do not determine the pose, fit only as a mirror
-/// image or worse than the rms limit, or if the iteration does not converge.
+/// Returns an error in these cases:
+///
+/// - The points are too few, repeated, on one line or not finite.
+/// - The size of the point cloud does not agree with the size of the surface.
+/// - The probe radius is not positive, or is too large for the surface.
+/// - The points do not determine the pose.
+/// - Only the mirror image of the points fits the surface.
+/// - The rms deviation exceeds the rms limit.
+/// - The iteration does not converge.
 pub fn register(
     nominal: &Nominal,
     measured: &[Point],

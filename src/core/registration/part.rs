@@ -29,14 +29,18 @@ pub(super) struct Part<'a> {
 }
 
 impl<'a> Part<'a> {
-    /// Checks the input before any pose is tried. Returns the nominal surface with its offset (the probe radius), and
-    /// with the centroid and the rms size of the measured points.
+    /// Checks the input before any pose is tried. Returns the nominal surface together with the offset in mm (the probe
+    /// radius, or 0), and with the centroid and the rms size of the measured points.
     ///
     /// # Errors
-    /// Returns an error if all coordinates are locked and `options` contains no start pose. Returns an error if the
-    /// points are too few, not finite, on one line or repeated, or if their rms size does not fit the nominal surface.
-    /// Returns an error if the probe radius is not positive, or is at least half of the rms size of the nominal
-    /// surface; contact points need no radius.
+    /// Returns an error in these cases:
+    ///
+    /// - All coordinates are locked, but `options` contain no start pose.
+    /// - The points are not finite or repeated, or fewer than the number of free coordinates plus one.
+    /// - The points lie on one line, or their rms size does not agree with the rms size of the nominal surface. This is
+    ///   not checked if all coordinates are locked.
+    /// - The probe radius is not positive, or is at least half of the rms size of the nominal surface. This is not
+    ///   checked for contact points (points on the part instead of probe centres), because they need no radius.
     pub(super) fn new(
         nominal: &'a Nominal,
         measured: &[Point],
@@ -80,7 +84,10 @@ impl<'a> Part<'a> {
         Ok(Self { nominal, offset_mm, subtract_mm, centroid: middle, size_mm, min_singular_share: least_share })
     }
 
-    /// Returns the offset surface on the given side, with the distance model and the facet lookup of `options`.
+    /// Returns the offset surface on the given side of the nominal surface. `options` select two things: the distance
+    /// model (the distance from a flat or from a curved facet), and the rule that finds the facet for a point. The rule
+    /// is the facet above or below the point along z for [`Method::SubtractRadius`], and otherwise the facet that
+    /// contains the projection of the point.
     pub(super) fn surface(&self, options: &RegistrationOptions, side: Side) -> OffsetSurface<'a> {
         let lookup = if options.method == Method::SubtractRadius { Lookup::AlongZ } else { Lookup::ContainingFacet };
         OffsetSurface::new(self.nominal, self.offset_mm, side)

@@ -103,11 +103,14 @@ fn point_warnings(found: &Registration) -> Vec<String> {
     doubts
 }
 
-/// Estimates how many of the `off_part` points (points whose projection is beyond the edge of the nominal surface) lie
-/// over a gap inside the surface. The others lie outside its outer edge.
+/// Estimates how many points lie over a gap inside the nominal surface. `off_part` is the number of all points off the
+/// part: points whose projection is beyond an edge of the surface. A point off the part lies either over a gap or
+/// outside the outer edge.
 ///
-/// A point lies over a gap if all eight sectors of the xy plane around the point contain points on the part. Examines
-/// at most 2000 points of each kind, and scales the result to `off_part` points.
+/// A point lies over a gap if there are points on the part in all directions around it. For this test, the xy plane of
+/// the model frame around the point is divided into eight sectors, and each sector must contain a point on the part.
+/// Examines at most 2000 points off the part and at most 2000 points on the part, and scales the result to `off_part`
+/// points.
 fn count_in_gaps(found: &Registration, off_part: usize) -> usize {
     /// Number of directions in the xy plane of the model frame.
     const SECTORS: usize = 8;

@@ -198,8 +198,10 @@ fn scaled_covariance(spectrum: &Spectrum, rank: usize, variance: f64) -> Matrix6
 }
 
 /// Describes the motions of the part that change no distance: shifts along a direction, and rotations about an axis.
-/// Returns one entry for all shifts together, and one for each rotation axis or one for all rotations about a point.
-/// Returns an empty list if `count` is 0.
+/// Returns an empty list if `count` is 0. Otherwise the list contains:
+///
+/// - one entry that names the directions of all shifts, if there are shifts;
+/// - one entry for each rotation axis, or a single entry if every rotation about one point changes no distance.
 ///
 /// The columns of `basis` are motions in scaled coordinates (translation in units of the rms size of the points,
 /// rotation about their centroid in radians). They span a space of `count` dimensions. `scaling` contains the centroid
@@ -310,13 +312,16 @@ fn direction_name(v: &Vector) -> String {
 }
 
 /// Describes the directions of the pose that the points determine poorly: shifts along the axes of the model frame, and
-/// rotations about these axes through the centroid of the points. A direction is listed if its standard uncertainty at
-/// the rim, in mm, exceeds `sigma_mm`, the standard deviation of one point. Directions with similar uncertainty (within
-/// a factor of two) share one entry.
+/// rotations about these axes through the centroid of the points.
+///
+/// The uncertainty of a rotation is given in mm, as the motion of a point at the rim of the part. The rim is taken at
+/// the rms size of the points from the centroid. A direction is listed if its standard uncertainty exceeds `sigma_mm`,
+/// the standard deviation of one point. Shifts whose uncertainties differ by less than a factor of two share one entry;
+/// the same holds for rotations.
 ///
 /// `scaled` is the covariance of the pose in scaled coordinates (translation in units of the rms size of the points,
-/// rotation in radians). Returns an empty list if `some_held` is true: then the surface does not determine some
-/// direction at all.
+/// rotation in radians). Returns an empty list if `some_held` is true. This flag means that the surface does not
+/// determine some direction at all.
 fn uncertain_directions(
     scaled: &Matrix6<f64>,
     sigma_mm: f64,
@@ -368,8 +373,9 @@ pub(super) fn format_length(mm: f64) -> String {
 ///
 /// - About 6800 inliers or more: divides space into cubes with an edge of a fifteenth of the rms size of the surface. A
 ///   place is covered if its cube contains an inlier. The cubes are small enough to show a missing corner.
-/// - Fewer inliers: a place is covered if an inlier is within 1.1 times the spacing that the same number of evenly
-///   spread points would have. So a full pattern leaves no gap, and a line covers only its own strip.
+/// - Fewer inliers: a place is covered if the nearest inlier is within a limit. The limit is 1.1 times the point
+///   spacing that the same number of inliers would have if they were spread evenly over the surface. So inliers spread
+///   evenly over the surface cover all of it. Inliers along a line cover only a strip.
 pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     const MAX_POINTS: usize = 50_000;
     // A disc and a rectangle have an area of about 2.5^2 times the square of their rms size.
@@ -446,8 +452,10 @@ impl CoverageCells {
     }
 
     /// Returns the index of the cube that contains the point `p`, for the list of marks. Returns `None` if `p` lies
-    /// outside the grid of cubes. Along an axis with 256 cubes, the maximum, the last cube includes all points beyond
-    /// its far side.
+    /// outside the grid of cubes.
+    ///
+    /// There is one exception. The grid has at most 256 cubes along an axis. Along an axis with 256 cubes, a point
+    /// beyond the far side of the last cube counts as inside this cube.
     fn index(&self, p: &Point) -> Option<usize> {
         let at = Self::cell(p, self.per_mm);
         let mut index = 0;

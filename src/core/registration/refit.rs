@@ -191,15 +191,20 @@ fn reproject_far_points(problem: &Problem, correspondences: &mut [Correspondence
     correspondences.par_iter_mut().zip(problem.measured).filter_map(|both| again(both).then_some(())).count()
 }
 
-/// Decides for each point whether it takes part in the fit, and stores this in `correspondences`. Returns the number of
-/// points whose decision changed. If `both_ways` is false, a rejected point stays rejected.
+/// Decides for each point whether it takes part in the fit, and stores the decision in `correspondences`. Returns the
+/// number of points whose decision changed. If `both_ways` is false, points can only be rejected; a rejected point
+/// stays rejected.
 ///
-/// Rejects points whose projection is beyond the edge of the surface, and outliers. The limit is
-/// `options.outlier_sigmas` robust standard deviations from the median distance. A point beyond this limit is an
-/// outlier if its distance also differs from the distances of its neighbours. A point beyond four times the limit is
-/// always an outlier. So a large but smooth form error gives no outlier below four times the limit.
+/// Rejects two kinds of points: points whose projection is beyond the edge of the surface, and outliers. The limit for
+/// outliers is `options.outlier_sigmas` times the robust standard deviation of the distances. A point is an outlier in
+/// two cases:
 ///
-/// A rejected point can later be found to be form of the part, see [`super::isolated_touches`].
+/// - Its distance differs from the median distance by more than the limit, and from the median distance of its
+///   neighbours by more than half the limit.
+/// - Its distance differs from the median distance by more than four times the limit.
+///
+/// So a large but smooth form error gives no outlier below four times the limit. After the fit,
+/// [`super::isolated_touches`] changes an outlier back to an inlier if its neighbours confirm a form error.
 fn select_fit_points(
     problem: &Problem,
     options: &RegistrationOptions,
@@ -231,10 +236,10 @@ fn select_fit_points(
 }
 
 /// Returns one flag for each index in `suspects`, the points that may be outliers. A flag is true if the distance of
-/// the point differs by more than `limit_mm` from the median distance of its eight nearest neighbours.
+/// the point from the surface differs by more than `limit_mm` from the median distance of its eight nearest neighbours.
 ///
-/// Ignores neighbours nearer than half of the mean point spacing, because they repeat the same place with the same
-/// fault. The flag is true if there are no other neighbours among the 64 nearest points.
+/// Points nearer than half of the mean point spacing do not count as neighbours. They are repeated touches at the same
+/// place, and can have the same fault. The flag is true if none of the 64 nearest points counts as a neighbour.
 fn isolated_flags(
     measured: &[Point],
     correspondences: &[Correspondence],

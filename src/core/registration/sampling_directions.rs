@@ -18,13 +18,17 @@ const MAX_RELATIVE_CHANGE: f64 = 0.5;
 /// Maximum number of points that are examined.
 const MAX_EXAMINED: usize = 400;
 
-/// Returns a lower limit for singular values of the Jacobian, as a share (0 to 1) of the root of the sum of all squared
-/// singular values. The shape of the part does not determine the directions below this limit; only the node positions
-/// of the nominal grid determine them.
+/// Returns a lower limit for the singular values of the Jacobian. The limit is a share (0 to 1) of the root of the sum
+/// of all squared singular values. The shape of the part does not determine the directions of the pose with a smaller
+/// singular value. Only the node positions of the nominal grid determine these directions. An example is the rotation
+/// of a spherical cap about its axis.
 ///
-/// Tests the directions with a share of at most 1e-4. Compares the Jacobian of the surface with the Jacobian of a
-/// surface through every second node. Returns `None` if no direction depends on the node positions, if the surface is
-/// not a single grid, or if the coarser surface cannot be made.
+/// Only directions with a share of at most 1e-4 are tested. The test compares the Jacobian of the surface with the
+/// Jacobian of a coarser surface through every second node. A direction depends on the node positions if its part of
+/// the Jacobian changes by more than half.
+///
+/// Returns `None` if no direction depends on the node positions, if the surface is not a single grid, or if the coarser
+/// surface cannot be made.
 pub(super) fn sampling_share(problem: &Problem, descent: &Descent, correspondences: &[Correspondence]) -> Option<f64> {
     let free = free_projector(&problem.locked, &descent.scaling);
     let gram = descent.sums.gram();

@@ -15,8 +15,9 @@ impl Spectrum {
     /// Computes the singular values S and the right singular vectors V of the Jacobian A from `gram` = A^T A = V S^2
     /// V^T, by a symmetric eigendecomposition. The singular values are in descending order.
     ///
-    /// The rotations in A are about the centroid of the points, and the translations are in units of their rms size. So
-    /// A^T A loses only directions that the surface does not determine.
+    /// A^T A has larger rounding errors than A. They do no harm here, because A is scaled: its rotations are about the
+    /// centroid of the points, and its translations are in units of the rms size of the points. With this scaling, the
+    /// rounding errors hide only directions that the surface does not determine.
     pub(crate) fn new(gram: &Matrix6<f64>) -> Self {
         let eigen = SymmetricEigen::new(*gram);
         let mut order: [usize; 6] = std::array::from_fn(|k| k);
@@ -30,9 +31,9 @@ impl Spectrum {
     /// Returns the number of directions of the pose that the surface determines. These are the directions with a
     /// squared singular value above `whole * least_share^2`.
     ///
-    /// `whole` is the sum of all squared singular values before any direction was locked. `least_share` is the minimum
-    /// share, from 0 to 1. Because `whole` includes the locked directions, the rounding error in a locked direction
-    /// does not count as a direction.
+    /// `least_share` is a share from 0 to 1. `whole` is the sum of all squared singular values before any direction was
+    /// locked. A locked direction has a singular value of 0 except for rounding errors. `whole` includes the locked
+    /// directions, so that the limit exceeds these rounding errors.
     pub(crate) fn rank(&self, least_share: f64, whole: f64) -> usize {
         let limit = whole * least_share * least_share;
         (0..6).take_while(|&k| self.squares[k] > limit).count()

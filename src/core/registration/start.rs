@@ -95,15 +95,16 @@ pub(crate) fn initial_pose(
 }
 
 /// Returns the rms distance in mm of the best fit of the mirror image of the points, on the given side of the surface.
-/// Tries poses without locked coordinates. Uses a sample of the points and the smallest nine tenths of the distances.
-/// Returns `None` if no pose is found.
+/// The search treats all six coordinates of the pose as free, even if `options` lock some. The fit uses a sample of the
+/// points. The rms is taken from the smallest nine tenths of the distances. Returns `None` if no pose is found.
 pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     searched_rms(part, &mirrored(measured), options, side)
 }
 
 /// Returns the rms distance in mm of the best fit of the measured points, not mirrored, on the given side of the
-/// surface. Tries poses without locked coordinates. Uses a sample of the points and the smallest nine tenths of the
-/// distances. Returns `None` if no pose is found.
+/// surface. The search treats all six coordinates of the pose as free, even if `options` lock some. The fit uses a
+/// sample of the points. The rms is taken from the smallest nine tenths of the distances. Returns `None` if no pose is
+/// found.
 pub(crate) fn free_rms(part: &Part, measured: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     let some: Vec<Point> = sample_evenly(measured, 4 * COMPARE_POINTS).copied().collect();
     searched_rms(part, &some, options, side)
@@ -135,9 +136,9 @@ fn mirrored(measured: &[Point]) -> Vec<Point> {
     sample_evenly(measured, 4 * COMPARE_POINTS).map(|p| Point::new(-p.x, p.y, p.z)).collect()
 }
 
-/// Returns the rms distance in mm of the best fit of `points` on the given side of the surface. Tries many poses
-/// without locked coordinates. Uses a sample of the points and the smallest nine tenths of the distances. Returns
-/// `None` if no pose is found.
+/// Returns the rms distance in mm of the best fit of `points` on the given side of the surface. The search tries many
+/// poses, and treats all six coordinates of the pose as free, even if `options` lock some. The fit uses a sample of the
+/// points. The rms is taken from the smallest nine tenths of the distances. Returns `None` if no pose is found.
 fn searched_rms(part: &Part, points: &[Point], options: &RegistrationOptions, side: Side) -> Option<f64> {
     let options = RegistrationOptions { side: side.into(), locked: [false; 6], ..*options };
     let search = Search::new(part, points, &options);
@@ -343,14 +344,18 @@ impl<'a> Search<'a> {
         between.angle_rad() + shift / self.part.size_mm
     }
 
-    /// Returns the cap for a distance in [`Self::score`], in mm: larger distances count as this one.
+    /// Returns the upper limit, in mm, for the distance of one point in [`Self::score`]: a tenth of the rms size of the
+    /// measured points. The score counts a larger distance as equal to this limit.
     fn truncation_mm(&self) -> f64 {
         0.1 * self.part.size_mm
     }
 
-    /// Scores a pose on `points`; a smaller score is better. Returns the root mean square, in mm, of the distances from
-    /// the part. A distance beyond the edge of the surface is included. Each distance is limited to
-    /// [`Self::truncation_mm`], so that points far away do not dominate.
+    /// Returns the score of the pose `cmm_from_model`, which maps the model frame to the CMM frame. The score is the
+    /// root mean square, in mm, of the distances of `points` from the part; a smaller score is better.
+    ///
+    /// If the projection of a point lies beyond the edge of the surface, its distance from the edge is included in the
+    /// distance of the point. Each distance is limited to [`Self::truncation_mm`], so that points far away do not
+    /// dominate.
     fn score(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> f64 {
         let limit2 = self.truncation_mm().powi(2);
         let sum: f64 = self.squared_distances_mm2(surface, cmm_from_model, points).map(|d2| d2.min(limit2)).sum();
@@ -430,12 +435,17 @@ impl<'a> Search<'a> {
     }
 
     /// Returns the pose with the smallest rotation between model frame and CMM frame, among the poses that fit as well
-    /// as `best`. These are the poses in `all`, and two more that are refined from start poses without rotation. A pose
-    /// fits as well if its rms is at most 1.1 times the rms of `best` plus 1e-5 mm. Returns `best` if the selected pose
-    /// is nearly equal to `best`.
+    /// as `best`. The reason: if the surface does not determine a rotation, the coordinates in the measured file are
+    /// the only information about it.
     ///
-    /// The reason: if the surface does not determine a rotation, the coordinates in the measured file are the only
-    /// information about it.
+    /// The candidates are the poses in `all`, and up to two more that are refined here from start poses without
+    /// rotation. A candidate fits as well as `best` if all three conditions hold:
+    ///
+    /// - It is on the same side of the surface.
+    /// - Its rms is at most 1.1 times the rms of `best` plus 1e-5 mm.
+    /// - Its share of points off the part is not larger.
+    ///
+    /// Returns `best` if the selected pose is nearly equal to `best`, or if no candidate fits as well.
     fn prefer_file_frame(&self, best: Candidate, all: &[Candidate]) -> Candidate {
         /// Largest ratio of two rms that differ by chance.
         const MAX_RMS_RATIO: f64 = 1.1;
@@ -586,8 +596,8 @@ impl Frame {
         Self { origin, axes: nalgebra::Matrix3::from_columns(&[first, second, normal]) }
     }
 
-    /// Returns the pose that maps the frame `other` to this frame: its origin to this origin, and its axes to these
-    /// axes.
+    /// Returns the pose that maps the frame `other` to the frame `self`: the origin of `other` to the origin of `self`,
+    /// and the axes of `other` to the axes of `self`.
     fn from(&self, other: &Frame) -> Pose {
         let rotation = self.axes * other.axes.transpose();
         Pose { rotation, translation_mm: self.origin.coords - rotation * other.origin.coords }.orthonormalised()

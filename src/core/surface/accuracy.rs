@@ -155,8 +155,9 @@ impl ErrorEstimate {
 }
 
 /// Estimates the errors of the distances to a nominal surface through the points of `samples`. Builds two coarser
-/// surfaces from a part of the points, and measures the distances of the withheld points from these surfaces. The
-/// errors of the two give the error of the full sampling by extrapolation. See the module documentation.
+/// surfaces, each from a part of the points. Measures the distances of the other (withheld) points from each coarser
+/// surface: these distances are the errors of this surface. Extrapolates the errors of the two coarser surfaces to the
+/// surface through all points. See the module documentation.
 ///
 /// Frame: model. Units: millimetres.
 ///
@@ -214,7 +215,8 @@ struct WithheldErrors {
 }
 
 impl WithheldErrors {
-    /// Moves all withheld points near the border to the points inside.
+    /// Moves all withheld points (points that the coarser surface does not use) from the list `border` to the list
+    /// `inside`. The estimate then does not distinguish places near the border from places inside.
     fn merge_border(&mut self) {
         self.inside.append(&mut self.border);
     }
@@ -350,11 +352,14 @@ fn measure_withheld(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Wi
 }
 
 /// Extrapolates the errors of two coarser samplings, `fine` and `coarse`, to the sampling with all points (Richardson
-/// extrapolation). `kind` is 0 for the flat distance and 1 for the curved distance. `factor` is the spacing of `fine`
-/// divided by `spacing_mm`, the spacing of all points. `step` is the spacing of `coarse` divided by the spacing of
-/// `fine`.
+/// extrapolation). Returns the estimated errors inside and near the border in mm, the largest error, and the
+/// reliability of the estimate.
 ///
-/// Does not extrapolate if the error is only rounding or noise. Panics if `fine` has no points inside.
+/// `kind` is 0 for the errors of the distance from flat facets, and 1 for the errors of the distance from curved
+/// facets. `spacing_mm` is the spacing of all points. `factor` is the spacing of `fine` divided by `spacing_mm`. `step`
+/// is the spacing of `coarse` divided by the spacing of `fine`.
+///
+/// Returns the errors of `fine` unchanged if they are only rounding or noise. Panics if `fine` has no points inside.
 fn extrapolate_errors(
     fine: &WithheldErrors,
     coarse: &WithheldErrors,
@@ -417,8 +422,9 @@ fn assess_reliability(observed_order: f64, least: f64, rms_mm: f64, spacing_mm: 
     }
 }
 
-/// Returns PV, RMS and the largest absolute error of the points in `set`; zeros if there are none. `kind` is 0 for the
-/// flat and 1 for the curved distance.
+/// Returns PV, RMS and the largest absolute value of the errors of the points in `set`, in mm. Returns zeros if `set`
+/// is empty. `kind` is 0 for the errors of the distance from flat facets, and 1 for the errors of the distance from
+/// curved facets.
 fn error_figures(set: &[WithheldPoint], kind: usize) -> ErrorFigures {
     if set.is_empty() {
         return ErrorFigures::default();

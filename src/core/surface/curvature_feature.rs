@@ -25,7 +25,9 @@ impl CurvatureFeature {
         self.curvatures[1] - self.curvatures[0]
     }
 
-    /// Returns the same feature with the opposite normal. The principal curvatures change sign and order.
+    /// Returns the same curvature feature (a place with its normal and principal curvatures) with the opposite normal.
+    /// The principal curvatures change sign and order, so that the smaller one is still the first. The principal
+    /// direction changes to the direction of the new first curvature.
     pub(crate) fn flipped(&self) -> Self {
         Self {
             point: self.point,
@@ -35,11 +37,12 @@ impl CurvatureFeature {
         }
     }
 
-    /// Moves the feature onto the offset surface: by the distance `radius_mm` (r) along the normal towards `side`.
-    /// Returns the moved feature, with its normal towards `side` and the curvatures of the offset surface. Returns
-    /// `None` if 1 - r k is not positive for a principal curvature k: the offset surface folds there.
+    /// Moves the curvature feature (a place with its normal and principal curvatures) onto the offset surface: by the
+    /// distance `radius_mm` (r) along the normal towards `side`. Returns the moved feature, with the normal towards
+    /// `side` and the curvatures of the offset surface. Returns `None` if 1 - r k is not positive for a principal
+    /// curvature k: the offset surface folds there.
     ///
-    /// Equation: a normal curvature k, positive if the surface bends towards `side`, becomes k / (1 - r k). The
+    /// Equation: a principal curvature k, positive if the surface bends towards `side`, becomes k / (1 - r k). The
     /// principal directions do not change.
     pub(crate) fn offset(&self, radius_mm: f64, side: Side) -> Option<Self> {
         let seen = if side == Side::Normal { *self } else { self.flipped() };

@@ -116,8 +116,9 @@ fn flushed_to_zero(coordinate: f64) -> f64 {
     if coordinate.abs() < 1e-40 { 0.0 } else { coordinate }
 }
 
-/// Returns the error that names two points whose `places` in the plane are equal: the first such pair in the order of
-/// u, then v. At least two places must be equal.
+/// Returns an error that names two points at the same place in the plane. `places` contains the plane coordinates (u,
+/// v) of each of the `points`. If there are several such pairs, names the pair with the smallest u, and among equal u
+/// with the smallest v. At least two places must be equal.
 fn first_duplicate(points: &[Point], places: &[[f64; 2]]) -> SurfaceError {
     let mut order: Vec<usize> = (0..places.len()).collect();
     let key = |i: usize| (places[i][0], places[i][1]);
@@ -254,7 +255,8 @@ fn usual_lengths(t: &Triangles, lengths: &EdgeLengths, suspects: &[u32]) -> Hash
     neighbours.iter().map(confirmed).collect()
 }
 
-/// Returns a map from each vertex in `vertices` to the triangles that meet there.
+/// Returns a map from each vertex in `vertices` to the numbers of the triangles that have this vertex as a corner. A
+/// vertex without triangles is not in the map.
 fn triangles_at(t: &Triangles, vertices: impl Iterator<Item = u32>) -> HashMap<u32, Vec<u32>> {
     let mut is_wanted = vec![false; t.corners.par_iter().flatten_iter().max().map_or(0, |most| *most as usize + 1)];
     vertices.for_each(|c| is_wanted[c as usize] = true);

@@ -201,11 +201,11 @@ pub(crate) fn offset_corner<T: Real>((point, normal): ([T; 3], [T; 3]), sign: T,
     ([point[0] + normal[0] * radius_mm, point[1] + normal[1] * radius_mm, point[2] + normal[2] * radius_mm], normal)
 }
 
-/// Packs four vertices into SIMD lanes, one vertex per lane. Returns their points and their normals, each as x, y and z
-/// of the four vertices.
+/// Packs four vertices into SIMD lanes, one vertex per lane. Returns the points and the normals of the vertices. Each
+/// of the two results contains three SIMD vectors: the four x, the four y and the four z.
 ///
-/// Each SIMD vector is built directly from registers. This avoids an array in memory, because reading that array would
-/// wait for four narrow stores.
+/// Each SIMD vector is built directly from four numbers, not through an array in memory. An array would be slower: the
+/// processor must finish the four single writes before it can read them as one vector.
 #[inline(always)]
 pub(crate) fn vertices_x4([a, b, c, d]: &[Vertex; LANES]) -> (Vector3x4, Vector3x4) {
     let normal = [

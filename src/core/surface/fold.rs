@@ -60,11 +60,17 @@ impl OffsetSurface<'_> {
         Some(SurfaceError::OffsetFolds { at, concave_radius_mm: -1.0 / curvature, probe_radius_mm: self.radius_mm() })
     }
 
-    /// Returns the numbers of the facets of a patch at which the offset surface folds.
+    /// Returns the numbers of the facets of a patch at which the offset surface folds (the nominal surface is more
+    /// concave than the probe).
     ///
-    /// A grid is checked in two steps. The first step checks facets two nodes wide with an enlarged probe. Only if one
-    /// of these facets folds, the second step checks one facet of each cell. In a mesh, up to [`MAX_CHECKED_FACETS`]
-    /// facets spread over the mesh are checked.
+    /// A grid is checked in two steps, because the first step is fast:
+    ///
+    /// - The first step checks a coarse grid. Each of its facets is two nodes wide. The probe radius is enlarged by the
+    ///   factor 1.4, so that the coarse grid misses no fold.
+    /// - The second step checks one facet of each cell of the full grid, with the true probe radius. It runs only if a
+    ///   facet folds in the first step.
+    ///
+    /// In a mesh, up to [`MAX_CHECKED_FACETS`] facets spread over the mesh are checked.
     fn folded_facets(&self, patch: &Patch) -> Vec<u32> {
         match &patch.topology {
             Topology::Grid(grid) => {
@@ -90,9 +96,12 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns the input for the coarse check of one row of a grid: the nodes of row `row`, the nodes [`STEP`] rows
-    /// above (or of the last row), and the signed offset in mm for the enlarged probe. The offset is negative if the
-    /// probe is on the side opposite to the normals.
+    /// Returns the input for the coarse check of one row of a grid for folds. The coarse check uses facets two nodes
+    /// wide, and a probe radius enlarged by the factor [`PROBE_ENLARGEMENT`].
+    ///
+    /// The result contains the nodes of row `row`, the nodes of the row that is [`STEP`] rows above, and the enlarged
+    /// radius in mm as a signed offset. If the grid has no row [`STEP`] rows above, its last row is used. The offset is
+    /// negative if the probe is on the side opposite to the normals.
     fn wide_row<'a>(&self, grid: &GridTopology, nodes: &'a [Vertex], row: usize) -> WideRow<'a> {
         let columns = grid.columns();
         let up = STEP.min(grid.rows() - 1 - row);
@@ -103,8 +112,9 @@ impl OffsetSurface<'_> {
         }
     }
 
-    /// Returns true if the offset by the probe radius reverses a facet or makes it flat. `corners` are the vertices of
-    /// the facet.
+    /// Returns true if the facet folds when its vertices are moved by the probe radius along their normals. A facet
+    /// folds if the moved facet is turned over, or if its area becomes zero. `corners` are the numbers of the vertices
+    /// of the facet in `patch`.
     ///
     /// Criterion: the matrix E + r B is not positive definite. E and B are the fundamental forms of the facet, see
     /// [`Self::fundamental_forms`], and r is the probe radius.
@@ -158,8 +168,9 @@ struct WideRow<'a> {
 impl pulp::NullaryFnOnce for WideRow<'_> {
     type Output = bool;
 
-    /// Returns true if the offset by `reach`, a signed length in mm, folds at least one facet of this row. A facet with
-    /// a hole as a corner has NaN coordinates and does not count.
+    /// Returns true if at least one facet of this row folds when its vertices are moved along their normals by `reach`,
+    /// a signed length in mm. A facet folds if the moved facet is turned over or has no area. A facet with a hole of
+    /// the grid as a corner has NaN coordinates, and never counts as folded.
     #[inline(always)]
     fn call(self) -> bool {
         let (nodes, above) = (self.nodes, &self.above[..self.nodes.len()]);
@@ -185,11 +196,13 @@ impl pulp::NullaryFnOnce for WideRow<'_> {
 }
 
 impl WideRow<'_> {
-    /// Returns true if the offset by `reach` folds at least one of four facets, one per SIMD lane. `here`, `next` and
-    /// `up` are the three corners of the facets: the first corner, the next corner in the same row, and the corner in
-    /// the row above. Each is a pair of points and unit normals.
+    /// Returns true if at least one of four facets, one per SIMD lane, folds when its vertices are moved along their
+    /// normals by `reach`. `here`, `next` and `up` are the three corners of the facets: the first corner, the next
+    /// corner in the same row, and the corner in the row above. Each is a pair of points and unit normals.
     ///
-    /// A facet folds if its matrix is not positive definite, as in [`is_not_positive_definite`].
+    /// Criterion: the matrix E + r B of the facet is not positive definite. E and B are the first and the second
+    /// fundamental form of the facet, and r is `reach`. [`is_not_positive_definite`] tests the same criterion for one
+    /// facet.
     #[inline(always)]
     fn any_folds_x4(
         &self,

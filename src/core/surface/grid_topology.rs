@@ -48,7 +48,8 @@ impl GridTopology {
         Self { columns: columns as u32, rows: rows as u32, present, regular }
     }
 
-    /// Builds the triangles over a grid that is known to be regular in x and y and to have no hole.
+    /// Builds the triangles of the grid `found`. `found` holds the number of columns and rows, and x and y of the first
+    /// and the last node. The grid must be regular in x and y and must have no hole.
     pub(crate) fn from_ordered_grid(found: &OrderedGrid) -> Self {
         let [low, high] = found.corners;
         let per_mm = |k: usize, n: usize| (n - 1) as f64 / (high[k] - low[k]);
@@ -75,9 +76,13 @@ impl GridTopology {
         self.rows as usize
     }
 
-    /// Returns the lower right facet of each cell in row `row` of the cells: the facet number and the node indices of
-    /// its three corners. The corners are the nodes 00, 10 and 11 of the cell; the first digit counts columns, the
-    /// second digit rows. The facets are returned even if a corner is a hole.
+    /// Returns one triangle of each cell of a row of cells: the lower right facet. A cell is the rectangle between four
+    /// neighbouring nodes, and two facets divide it. The row of cells `row` lies between the rows of nodes `row` and
+    /// `row + 1`.
+    ///
+    /// Each item is the facet number and the node indices of the three corners. The corners are the nodes 00, 10 and 11
+    /// of the cell: the first digit counts columns, the second digit rows. A facet is returned even if one of its
+    /// corners is a hole.
     pub(crate) fn row_of_facets(&self, row: usize) -> impl Iterator<Item = (u32, [u32; 3])> {
         let first = row as u32 * self.columns;
         (first..first + self.columns - 1).map(|node| (2 * node, [node, node + 1, node + self.columns + 1]))
@@ -102,9 +107,12 @@ impl GridTopology {
         nodes.filter(|&k| k != node && self.is_present(k as usize)).collect()
     }
 
-    /// Returns the lower right facet of the cell whose first node is `node`. If a node of this cell is a hole, or if
-    /// `node` is in the last row or column, returns the lower right facet of a cell nearby whose four nodes exist.
-    /// Returns facet 0 if the grid has no such cell.
+    /// Returns the number of a facet near the node `node`: the lower right facet of a cell. The cell is the one in
+    /// which `node` has the smallest column and row. If `node` is in the last column or row, the cell is the last one
+    /// in this direction.
+    ///
+    /// If one of the four nodes of this cell is a hole, another cell nearby is used whose four nodes exist. Returns
+    /// facet 0 if the grid has no such cell.
     pub(crate) fn facet_near(&self, node: u32) -> u32 {
         let (i, j) = (node % self.columns, node / self.columns);
         let (i, j) = self.nearest_whole_cell(i.min(self.columns - 2), j.min(self.rows - 2));
@@ -131,12 +139,13 @@ impl GridTopology {
         (node % self.columns, node / self.columns)
     }
 
-    /// Returns the column and the row of the cell that contains a target point. The target is `u` columns and `v` rows
-    /// away from the first node of the cell (i, j); `u` and `v` may be fractions or negative. The target is clamped to
-    /// the grid.
+    /// Returns the column and the row of the cell that contains a target point. The start is the node of the cell (i,
+    /// j) with the smallest column and row. The target is `u` columns and `v` rows away from the start. `u` and `v` may
+    /// be fractions or negative. A target outside the grid is moved to the nearest cell of the grid.
     ///
-    /// If a node of the target cell is a hole, halves `u` and `v` until the four nodes of the cell exist. Returns
-    /// `None` if the halving reaches the cell (i, j) or 1e-4 of the distance without success.
+    /// If one of the four nodes of the target cell is a hole, halves `u` and `v` and tries again. Returns `None` if the
+    /// target reaches the cell (i, j) and a node of this cell is a hole. Also returns `None` if the distance is less
+    /// than 1e-4 of the first distance and no cell was found.
     fn cell_towards(&self, (i, j): (u32, u32), u: f64, v: f64) -> Option<(u32, u32)> {
         let clamp =
             |from: u32, step: f64, cells: u32| (f64::from(from) + step).floor().clamp(0.0, f64::from(cells - 1));
@@ -181,12 +190,12 @@ impl Facets for GridTopology {
         if facet & 1 == 0 { [node, node + 1, far] } else { [node, far, far - 1] }
     }
 
-    /// Returns the next facet of a walk towards the projection of a point. `weights` are the barycentric weights of the
-    /// point in the facet `facet`.
+    /// Returns the number of the next facet in the search for the facet that contains the projection of a point.
+    /// `facet` is the present facet, and `weights` are the barycentric weights of the point in this facet.
     ///
-    /// Continues the plane of `facet` beyond its edges, and jumps to the cell in which the point lies in this plane. If
-    /// a node of that cell is a hole, takes a cell on the line between. Returns `None` if the new facet is `facet`
-    /// itself, or if no such cell has four nodes.
+    /// Extends the plane of `facet` beyond its edges. Jumps to the grid cell in which the point lies in this plane. If
+    /// one of the four nodes of that cell is a hole, takes a cell between the present cell and that cell. Returns
+    /// `None` if the new facet is `facet` itself, or if no cell on the way has four nodes.
     #[inline]
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32> {
         let (u, v) =
@@ -290,8 +299,8 @@ struct NodeBlock<'a> {
 impl pulp::NullaryFnOnce for NodeBlock<'_> {
     type Output = [Vertex; BLOCK];
 
-    /// Returns the 32 nodes of this block, from the index `first` on, with their fitted unit normals. Past the end of
-    /// the grid the last node is repeated.
+    /// Returns 32 consecutive nodes of the grid with their fitted unit normals. The first one is the node with the
+    /// index `first` of this block. Beyond the end of the grid, the last node of the grid is repeated.
     #[inline(always)]
     fn call(self) -> [Vertex; BLOCK] {
         const NONE: Vertex = Vertex { point: Point::new(0.0, 0.0, 0.0), normal: Vector::new(0.0, 0.0, 0.0) };

@@ -122,11 +122,11 @@ impl MeshTopology {
 impl MeshTopology {
     /// Writes the vertices around `vertex` into `ring`, each once. First come the neighbours of `vertex`,
     /// counter-clockwise (the first ring). Then come the other neighbours of these neighbours (the second ring).
-    /// Returns the number of vertices in the first ring, and the number in both rings together. Returns `None` if the
-    /// surface ends within the rings, or if `ring` is too small.
     ///
-    /// For speed, each neighbour of `vertex` is searched only on its outer side: among the facets outside the first
-    /// ring, from one edge of that ring to the next.
+    /// Returns two numbers: the count of the vertices in the first ring, and the count in both rings together. Returns
+    /// `None` if the surface ends within the rings, or if `ring` is too small.
+    ///
+    /// For speed, only the facets outside the first ring are searched for the vertices of the second ring.
     #[inline(always)]
     pub(crate) fn two_rings<const N: usize>(&self, vertex: u32, ring: &mut [u32; N]) -> Option<[usize; 2]> {
         let place = |facet: u32, of: u32| self.corners[facet as usize].iter().position(|&c| c == of);
@@ -202,7 +202,9 @@ impl Facets for MeshTopology {
     }
 }
 
-/// Returns for each facet the neighbours across its three edges. Finds them by sorting the edges.
+/// Returns three facet numbers for each facet: its neighbours across its three edges. Neighbour k is across the edge
+/// opposite to corner k; it is [`BORDER`] if no facet is there. `corners` are the vertex indices of each facet, and
+/// `points` are used only in the error. The neighbours are found by sorting the edges.
 ///
 /// # Errors
 /// Returns an error if more than two facets share an edge, or if two neighbours have opposite orientation.
@@ -246,9 +248,11 @@ fn find_doubled(corners: &[[u32; 3]], points: &[Point]) -> Option<SurfaceError> 
     Some(SurfaceError::DoubledTriangles { count, at: points[first as usize].into() })
 }
 
-/// Returns one facet number for each of the `vertices` vertices, or [`BORDER`] if no facet has this vertex. For a
-/// vertex on the border of the mesh, it is the facet from which a counter-clockwise walk around the vertex visits all
-/// its facets.
+/// Returns one facet number for each of the `vertices` vertices: a facet that has this vertex as a corner. The value is
+/// [`BORDER`] if no facet has this vertex.
+///
+/// For a vertex on the border of the mesh, the facet is the first one in counter-clockwise order around the vertex. A
+/// counter-clockwise walk from this facet therefore visits all facets at the vertex.
 fn first_facets(vertices: usize, corners: &[[u32; 3]], neighbours: &[[u32; 3]]) -> Vec<u32> {
     let mut first = vec![BORDER; vertices];
     for (facet, c) in corners.iter().enumerate() {

@@ -194,7 +194,8 @@ impl Nominal {
         }
     }
 
-    /// Rejects a surface that encloses a solid, because it does not show which of its faces is ground.
+    /// Checks that the surface does not enclose a solid. A closed surface does not show which side of the part is
+    /// ground.
     ///
     /// # Errors
     /// Returns [`SurfaceError::ClosedSolid`] if a mesh patch has no border.

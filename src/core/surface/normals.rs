@@ -28,15 +28,18 @@ pub(crate) struct LocalFit {
     pub(crate) direction: Vector,
 }
 
-/// Fits the normal and the principal curvatures of the surface at a vertex to its neighbours. The neighbours are whole
-/// rings of vertices around the vertex, as many rings as are needed for `wanted` neighbours or more (at most 64).
+/// Fits the normal and the principal curvatures of the surface at the vertex `vertex` to its neighbours. Ring k around
+/// a vertex holds the vertices k edges away. The neighbours are whole rings; rings are added until there are `wanted`
+/// neighbours or more (at most 64).
 ///
 /// Frame: the origin is the vertex. The axis w is the mean normal of the facets around the vertex. The axes u and v are
 /// two tangents. The fit is the cubic w = p u + q v + quadratic and cubic terms, by weighted least squares.
 ///
-/// A neighbour at the distance s has the weight 1/(1 + (s/h)^2), where h is the mean distance of the neighbours. So a
-/// far neighbour in an uneven ring affects the fit less. If the neighbours do not determine a cubic (at a border, on a
-/// line), a quadric is fitted, otherwise a plane. If they determine no plane either, the mean normal is returned.
+/// A neighbour at the distance s has the weight 1/(1 + (s/h)^2), where h is the mean distance of the neighbours. The
+/// weight reduces the effect of far neighbours.
+///
+/// At a border, the neighbours may not determine a cubic. Then a quadric is fitted. If they do not determine a quadric,
+/// a plane is fitted. If they do not determine a plane, the normal is the mean normal of the facets.
 pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshTopology, vertex: u32, wanted: usize) -> LocalFit {
     let mut ring = [0u32; MAX_NEIGHBOURS];
     let found = collect_rings(mesh, vertex, wanted, &mut ring);
@@ -44,9 +47,12 @@ pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshTopology, vertex: u32, wa
     fit_to_neighbours(points[vertex as usize], mean, ring[..found].iter().map(|&i| points[i as usize]))
 }
 
-/// Fits the normal and the principal curvatures of the surface at the point `at` to the given `neighbours`, of which at
-/// most 64 are used. Fits a local cubic by weighted least squares, with the same frame and weights as [`fit_to_ring`].
-/// `mean` is the approximate unit normal; the axis w of the fit points along it.
+/// Fits the normal and the principal curvatures of the surface at the point `at`. The fit uses the points `neighbours`
+/// (at most the first 64). `mean` is the approximate unit normal at `at`.
+///
+/// Fits a cubic w(u, v) by weighted least squares; a near neighbour has a larger weight. The origin of the frame is
+/// `at`, the axis w is `mean`, and the axes u and v are two tangents. The weights, and the simpler fits for few
+/// neighbours, are those of [`fit_to_ring`].
 pub(crate) fn fit_to_neighbours(at: Point, mean: Vector, neighbours: impl Iterator<Item = Point>) -> LocalFit {
     let [tu, tv] = tangents(&mean);
     let mut local = [[0.0; 3]; MAX_NEIGHBOURS];
@@ -363,9 +369,9 @@ fn collect_rings(mesh: &MeshTopology, vertex: u32, wanted: usize, ring: &mut [u3
     count
 }
 
-/// Appends the neighbours of the vertex `of` to `ring`. The first `count` entries of `ring` are vertices around
-/// `vertex`. Omits neighbours that `ring` already contains, and `vertex` itself. Ignores further neighbours if `ring`
-/// is full. Returns the new number of entries.
+/// Appends the neighbours of the vertex `of` to the list `ring` of the vertices around `vertex`. `count` is the number
+/// of entries that `ring` already has. Omits `vertex` itself and neighbours that are already in the list. Omits all
+/// further neighbours if `ring` is full. Returns the new number of entries.
 #[inline(always)]
 fn add_ring(mesh: &MeshTopology, of: u32, vertex: u32, ring: &mut [u32; MAX_NEIGHBOURS], mut count: usize) -> usize {
     mesh.visit_neighbours(of, |candidate| {

@@ -53,12 +53,13 @@ impl FacetIndex {
     /// Unknown facet: the search chooses its own start.
     pub const UNKNOWN: Self = Self { patch: 0, facet: u32::MAX };
 
-    /// Returns the index of a facet of a patch.
+    /// Combines the number `patch` of a patch and the number `facet` of a facet in this patch into one index.
     pub(crate) fn new(patch: u32, facet: u32) -> Self {
         Self { patch, facet }
     }
 
-    /// Returns the index of a facet of a surface with a single patch.
+    /// Creates the index of the facet with the number `facet` in the first patch (patch 0). Use it for a surface that
+    /// has a single patch.
     pub(crate) fn in_first_patch(facet: u32) -> Self {
         Self { patch: 0, facet }
     }
@@ -139,7 +140,7 @@ impl<'a> OffsetSurface<'a> {
         self.nominal
     }
 
-    /// Returns the offset in millimetres.
+    /// Returns the probe radius in millimetres. It is the distance of this offset surface from the nominal surface.
     pub fn radius_mm(&self) -> f64 {
         self.radius_mm
     }
@@ -166,11 +167,12 @@ impl<'a> OffsetSurface<'a> {
     }
 
     /// Projects the point `p`, in the model frame, onto the offset surface. Returns the projection. The search begins
-    /// at the facet `start`, where the last search for this point ended. Use [`FacetIndex::UNKNOWN`] if there was no
-    /// earlier search.
+    /// at the facet `start`: the facet that the previous search for this point returned. Use [`FacetIndex::UNKNOWN`] if
+    /// there was no previous search.
     ///
-    /// Beyond the edge, the surface is continued. Up to half a step of the sampling, the facet at the edge continues
-    /// it. Farther out, the tangent plane at the nearest point of the edge continues it.
+    /// If the projection lies beyond the edge of the surface, the surface is extended there. Up to half the local point
+    /// spacing of the nominal surface beyond the edge, the facet at the edge is extended. Farther out, the tangent
+    /// plane at the nearest point of the edge is used.
     #[inline]
     pub fn project(&self, p: &Point, start: FacetIndex) -> PointProjection {
         match self.nominal.patches() {
@@ -179,14 +181,17 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Projects the point `p` onto each of the `patches`. Returns the nearest projection that lies inside a patch. If
-    /// none lies inside, returns the one that is least beyond an edge. `start` is used only by the patch that it
-    /// belongs to.
+    /// Projects the point `p` onto each of the `patches` and returns the nearest projection. A projection inside a
+    /// patch is nearer than one beyond an edge. If no projection is inside, the one with the smallest distance beyond
+    /// an edge is the nearest. `start` is the facet where the search begins in the patch of this facet; the searches in
+    /// the other patches choose their own start.
     ///
-    /// The offset surfaces of two touching patches leave a gap over a convex seam. A projection in this gap counts as
-    /// on the part. A projection is in the gap if it is at most half a step of the sampling beyond an edge, and if this
-    /// is also true of the projection onto another patch. The distances of `p` from both projections may differ by half
-    /// a step at most.
+    /// At a convex common edge of two patches, their offset surfaces do not meet: there is a gap between them. A
+    /// projection in this gap counts as on the part. A projection is in the gap if three conditions are true:
+    ///
+    /// - It is at most half the local point spacing beyond an edge.
+    /// - The projection onto another patch is also at most half the local point spacing beyond an edge.
+    /// - The distances of `p` from the two projections differ by at most half the local point spacing.
     fn nearest_projection(&self, patches: &[Patch], p: &Point, start: FacetIndex) -> PointProjection {
         let feet: Vec<PointProjection> =
             patches.iter().enumerate().map(|(k, patch)| self.project_onto_patch(patch, k as u32, p, start)).collect();
@@ -210,12 +215,12 @@ impl<'a> OffsetSurface<'a> {
         best
     }
 
-    /// Projects the point `p` onto the offset surface if no start facet is known. Starts one search from a facet at
-    /// each of the three sample points of the surface nearest to `p`. Returns the nearest projection that the searches
-    /// find.
+    /// Projects the point `p` onto the offset surface without a known start facet. Takes the three points nearest to
+    /// `p` from a sample of the nominal surface. Starts one search at a facet near each of these three points. Returns
+    /// the nearest projection of the three searches.
     ///
-    /// One search is not enough: it moves only to neighbouring facets that are nearer. On the wrong wall of a gutter it
-    /// stops, because no neighbouring facet is nearer.
+    /// A single search can end at a wrong facet, because it moves only to neighbouring facets that are nearer. For
+    /// example, it can end on the wrong wall of a groove.
     #[cold]
     pub(crate) fn project_without_start(&self, p: &Point) -> PointProjection {
         let found = self
@@ -236,12 +241,13 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Walks over the flat facets of the nominal surface and returns a facet near the projection of the point `p`.
-    /// `start` is a facet number, or `u32::MAX` to let `facets` choose one. For a grid, whose normals are already
-    /// known, it returns the start facet without a walk.
+    /// Returns the number of a facet near the projection of the point `p`. Moves from facet to facet over the flat
+    /// facets of the nominal surface, without fitting normals. `start` is the number of the first facet; with
+    /// `u32::MAX`, `facets` chooses the first facet. For a grid, returns the first facet at once, because all normals
+    /// of a grid are known.
     ///
-    /// The walk fits no normal. At each facet, the point is moved back by the probe radius along the normal of the flat
-    /// facet.
+    /// `p` is the centre of the probe. At each facet, `p` is shifted by the probe radius along the normal of the flat
+    /// facet, back to the nominal surface.
     #[inline]
     fn approach<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: u32) -> u32 {
         let mut facet = if start == u32::MAX { facets.start(p) } else { start };
@@ -266,9 +272,9 @@ impl<'a> OffsetSurface<'a> {
         facet
     }
 
-    /// Returns the index of a facet of the first patch near the projection of the point `p`, without fitting a normal.
-    /// `start` is the facet at which the walk begins; [`FacetIndex::UNKNOWN`] lets `facets` choose one. The patch
-    /// number of `start` is ignored.
+    /// Returns the index of a facet near the projection of the point `p`, without fitting normals. `patch` must be the
+    /// first patch (patch 0) of the surface. `start` is the facet where the search begins; only its facet number is
+    /// used. With [`FacetIndex::UNKNOWN`], `facets` chooses the first facet.
     pub(super) fn facet_near<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: FacetIndex) -> FacetIndex {
         FacetIndex { patch: 0, facet: self.approach(patch, facets, p, start.facet) }
     }
@@ -312,7 +318,8 @@ impl<'a> OffsetSurface<'a> {
         self.project_in_facet(&here, p, self.weights(&here, p), true, FacetIndex { patch: number, facet })
     }
 
-    /// Returns a facet with its corners on the offset surface.
+    /// Returns a facet of the offset surface. `corners` are the indices of its three vertices in `patch`. Each corner
+    /// is the vertex shifted by the probe radius along its normal, towards the side of the probe.
     #[inline(always)]
     fn facet(&self, patch: &Patch, corners: [u32; 3]) -> Facet<f64> {
         let sign = self.side.sign();
@@ -331,12 +338,12 @@ impl<'a> OffsetSurface<'a> {
         facet.weights(&w)
     }
 
-    /// Returns the projection of the point `p` onto a facet whose index is `place`. `weights` are the barycentric
-    /// weights of `p` in the facet. `inside` is true if the projection lies on the surface, and false if it lies beyond
-    /// an edge where the surface ends.
+    /// Returns the projection of the point `p` onto the facet `facet`. `place` is the index of this facet. `weights`
+    /// are the barycentric weights of `p` in the facet. `inside` is true if the projection lies on the surface, and
+    /// false if it lies beyond an edge where the surface ends.
     ///
-    /// Up to half a step of the sampling beyond the edge, the facet is continued. Farther out, the tangent plane at the
-    /// nearest place of the edge is used.
+    /// If `inside` is false, the surface is extended. Up to half the local point spacing beyond the edge, the facet is
+    /// extended. Farther out, the tangent plane at the nearest point of the edge is used.
     #[inline(always)]
     fn project_in_facet(
         &self,
@@ -377,8 +384,9 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
-    /// Returns the distance of the point `p` from the tangent plane at a place of the edge, in mm, and the unit normal
-    /// of this plane. `at` are the barycentric weights of the place.
+    /// Returns the signed distance of the point `p` from a tangent plane of the surface, in mm, and the unit normal of
+    /// this plane. The plane touches the surface at one point of the edge of `facet`. `at` are the barycentric weights
+    /// of this point.
     #[cold]
     fn tangent_plane_distance(&self, facet: &Facet<f64>, p: &Point, at: &[f64; 3]) -> (f64, Vector) {
         let (on_flat, flat) = (Vector::from(facet.point(at)), Vector::from(facet.flat_normal()));

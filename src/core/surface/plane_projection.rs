@@ -82,8 +82,9 @@ impl PlaneProjection {
     }
 }
 
-/// Returns a text for an error message: the name of each projection in `shares`, and the percentage of the surface that
-/// it folds. The number of each pair is this share, from 0 to 1.
+/// Returns a text for an error message about the projections that were tried. Each pair in `shares` is a projection and
+/// the fraction of the surface, from 0 to 1, that this projection folds. A surface is folded where two parts of it lie
+/// on the same point of the plane. The text gives the name and the percentage of each projection.
 fn describe(shares: &[(PlaneProjection, f64)]) -> String {
     let name = |p: &PlaneProjection| match p {
         PlaneProjection::Auto => "auto",
@@ -115,14 +116,14 @@ impl Projector {
         }
     }
 
-    /// Returns the share, from 0 to 1, of the surface that the projection folds. The plane is divided into square
-    /// neighbourhoods with ten points each on average. The share counts the neighbourhoods that contain more than one
-    /// sheet of the surface. Neighbourhoods with fewer than six points do not count. Returns 1 if the projected points
-    /// cover no area.
+    /// Returns the fraction, from 0 to 1, of the surface that the projection folds. A surface is folded where two
+    /// layers of it lie above the same point of the plane. The plane is divided into squares with ten points each on
+    /// average. The fraction is the number of squares with more than one layer, divided by the number of squares with
+    /// at least six points. Returns 1 if the projected points cover no area.
     ///
-    /// A neighbourhood has several sheets if its points deviate strongly from their least-squares plane. In a
-    /// neighbourhood of size s, one smooth sheet deviates from its tangent plane only by a small part of s, even where
-    /// the sheet is steep. The points of two sheets deviate from any plane by half the distance between the sheets.
+    /// A square has more than one layer if the rms residual of its points about their least-squares plane is more than
+    /// 0.6 times the side of the square. One smooth layer has a small residual, even where the surface is steep. Two
+    /// layers have a residual of about half the distance between the layers.
     fn folded_share(&self, points: &[Point]) -> f64 {
         let stride = points.len().div_ceil(200_000);
         let placed: Vec<_> = points.iter().step_by(stride).map(|p| self.project(p)).collect();
@@ -225,7 +226,8 @@ fn best_fit_sphere(points: &[Point]) -> Option<Projector> {
     radius_mm.is_finite().then(|| Projector::Sphere { centre: middle + offset, radius_mm, axes: [tu, tv, pole] })
 }
 
-/// Returns true if the points lie on one line, except for rounding.
+/// Returns true if the points lie on one line, except for rounding. For speed, first tests a sample of at most 4096
+/// points. Tests all points only if the sample lies on one line.
 pub(crate) fn is_line(points: &[Point]) -> bool {
     const FEW: usize = 4096;
     // If a sample does not lie on a line, all points do not either.
@@ -233,7 +235,8 @@ pub(crate) fn is_line(points: &[Point]) -> bool {
     are_on_line(&some) && (some.len() == points.len() || are_on_line(points))
 }
 
-/// Returns true if the points lie on one line, except for rounding. Examines all points.
+/// Returns true if the points lie on one line, except for rounding. Always tests all points. Compares the second
+/// largest eigenvalue of the scatter matrix of the points with the largest one; the limit of the ratio is 1e-18.
 fn are_on_line(points: &[Point]) -> bool {
     let (_, eigen) = principal_axes(points);
     let mut spread: [f64; 3] = eigen.eigenvalues.into();

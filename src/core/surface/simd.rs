@@ -10,18 +10,21 @@ pub(crate) const LANES: usize = 4;
 pub(crate) trait Real:
     Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self>
 {
-    /// Returns `value` in every lane (one of the parallel numbers). For a single number, returns `value` itself.
+    /// Returns `value` as this type of number. If the type holds four numbers in parallel (four lanes), each of the
+    /// four is `value`.
     fn splat(value: f64) -> Self;
 
     /// Returns the square root.
     fn sqrt(self) -> Self;
 
-    /// Returns the unit vector in the direction of `v`. With four lanes, the components are multiplied by the
-    /// reciprocal of the length, so that one division replaces three.
+    /// Returns the unit vector in the direction of `v`. If the type holds four numbers in parallel (four lanes),
+    /// returns four unit vectors. The type with four lanes multiplies by the reciprocal of the length; this needs one
+    /// division instead of three.
     fn unit(v: &[Self; 3]) -> [Self; 3];
 
-    /// Returns the sum `self + second + third`. A single number adds them in this order. Four lanes add `second` and
-    /// `third` first, so that this addition need not wait for `self`. The results can therefore differ by rounding.
+    /// Returns the sum `self + second + third`. The order of the two additions depends on the type. A type with a
+    /// single number first adds `self` and `second`. A type with four parallel numbers first adds `second` and `third`,
+    /// because this addition need not wait for `self`. The results of the two types can therefore differ by rounding.
     fn plus(self, second: Self, third: Self) -> Self;
 }
 

@@ -121,7 +121,8 @@ impl Triangulation {
             .unzip()
     }
 
-    /// Returns the next edge along the face on the left of the edge `e`.
+    /// Returns the number of the edge that follows the edge `e` around the face on the left of `e`. The returned edge
+    /// starts where `e` ends.
     fn left_next(&self, e: u32) -> u32 {
         self.edges[(e ^ 1) as usize][BEFORE]
     }
@@ -167,10 +168,11 @@ fn divide(sites: SortedSites, range: Range<usize>, edges: &mut [Edge], base: u32
 
 impl SortedSites<'_> {
     /// Divides the points with the indices `range`, at least two, into two parts. A line parallel to the u axis or the
-    /// v axis separates the parts. Returns the index of the first point of the second part, and the axis (u or v) along
-    /// which the second part has the larger coordinates.
+    /// v axis separates the parts. Returns the index of the first point of the second part. Also returns the axis (u or
+    /// v) along which the second part has the larger coordinates.
     ///
-    /// If all points have the same key, divides the range in the middle. The axis is then u.
+    /// The points are sorted by a key (the position on a Z-curve, computed from u and v). If all points of the range
+    /// have the same key, divides the range in the middle. The returned axis is then u.
     fn cut(&self, range: &Range<usize>) -> (usize, CutAxis) {
         let keys = &self.keys[range.clone()];
         let differing = keys[0] ^ keys[keys.len() - 1];
@@ -206,7 +208,7 @@ impl FreeEdges {
         }
     }
 
-    /// Marks as deleted the edges whose numbers were never assigned.
+    /// Writes the mark for a deleted edge to each entry of `edges` whose number was never assigned to an edge.
     fn mark_deleted(&self, edges: &mut [Edge]) {
         for range in &self.fresh {
             edges[range.start as usize..range.end as usize].fill([DELETED; 3]);
@@ -289,13 +291,13 @@ impl Subdivision<'_> {
         }
     }
 
-    /// Deletes the edges that become invalid at one end of the base edge when two parts are merged. Returns the first
-    /// edge that remains. `left` and `right` are the two ends of the base edge. Starts at the edge `e`, whose origin is
-    /// one of these ends, and goes around this origin in the direction `way`: [`AFTER`] (counter-clockwise) or
-    /// [`BEFORE`] (clockwise).
+    /// Deletes invalid edges at one end of the base edge while two parts are merged. The base edge is the last edge
+    /// that connects the two parts; `left` and `right` are its two ends. All tested edges start at one of these ends.
     ///
-    /// Deletes an edge if it is not Delaunay: the circle through `left`, `right` and the destination of this edge
-    /// contains the destination of the next edge.
+    /// The first tested edge is `e`. The next ones follow around the same end in the direction `way`: [`AFTER`]
+    /// (counter-clockwise) or [`BEFORE`] (clockwise). Deletes an edge if the circle through `left`, `right` and the
+    /// destination of this edge contains the destination of the next edge. Such an edge is not Delaunay. Returns the
+    /// first edge that is not deleted.
     fn clear(&mut self, mut e: u32, way: usize, left: u32, right: u32) -> u32 {
         loop {
             let next = self.edge(e)[way];
@@ -400,7 +402,8 @@ impl Subdivision<'_> {
         self.edge(e ^ 1)[ORIGIN]
     }
 
-    /// Returns the next edge along the face on the left of the edge `e`.
+    /// Returns the number of the edge that follows the edge `e` around the face on the left of `e`. The returned edge
+    /// starts where `e` ends.
     #[inline(always)]
     fn left_next(&self, e: u32) -> u32 {
         self.edge(e ^ 1)[BEFORE]

@@ -218,11 +218,15 @@ impl CmmFolders {
         Ok(expected)
     }
 
-    /// Returns the result of a finished check of inbox files. If no check runs, first starts a check of the files
-    /// `found` in another thread. Then waits for the result for at most `read_timeout`.
+    /// Returns the result of a check of the files in the inbox. The check tests in another thread whether the files are
+    /// the result `expected`. If no check is running, starts a check of the files `found`. Then waits at most
+    /// `read_timeout` for the end of the check.
     ///
-    /// Returns `None` in three cases: the check still runs; the check was of another job; or the check accepted a file
-    /// that has changed since the check began.
+    /// Returns `None` in each of these cases:
+    ///
+    /// - The check is still running.
+    /// - The check was of another job.
+    /// - The check accepted a file that has changed since the check began.
     fn finished_judgement(&mut self, expected: &Expected, found: &[WatchedFile]) -> Option<FinishedJudgement> {
         let job = expected.stored.header.job();
         if self.running_judgement.is_none() {
@@ -380,9 +384,11 @@ impl Judge {
         Ok((self.requirements(expected).read(path, &bytes)?, sha))
     }
 
-    /// Returns the requirements for a result of the hand-over `expected`: the numbers of the targets, the known
-    /// properties of the files, and the probe radius with its tolerance in mm. The numbers of the targets are `None` if
-    /// any number of points is allowed.
+    /// Returns the requirements for a result file of the hand-over `expected`. They contain three items:
+    ///
+    /// - The numbers of the targets of the plan, or `None` if any number of points is allowed.
+    /// - The properties of the files from the cell file, for example the unit of length and the decimal mark.
+    /// - The probe radius and its tolerance, in mm.
     fn requirements<'a>(&'a self, expected: &'a Expected) -> ResultRequirements<'a> {
         ResultRequirements {
             targets: (!self.settings.free_count).then_some(&*expected.targets),
@@ -450,10 +456,13 @@ impl Judge {
         Ok(Some(accepted))
     }
 
-    /// Returns two lists. The first list contains the complete stations. Each is a pair: the file of measured points,
-    /// and the file of the reference points that the station measured. The second list contains texts about missing
-    /// items: the name of a missing file, or a file that still changes. `new` are the files in the inbox that may be
-    /// read.
+    /// Finds the files of each station among the files `new`, which are the files in the inbox that may be read. A
+    /// station is one place from which the part is measured, with its own frame. Each station has two files: the
+    /// measured points and the measured reference points. `stations` contains the names of these files. The part, the
+    /// job and the cycle of `ticket` are filled into the names.
+    ///
+    /// Returns two lists. The first list contains the pair of files of each complete station. The second list contains
+    /// texts about items that are awaited: a missing file, or a file that still changes.
     ///
     /// # Errors
     /// Returns an error if several files match one file name of a station.
@@ -495,12 +504,13 @@ impl Judge {
         }
     }
 
-    /// Returns the two file names of each station: the file of measured points and the file of reference points. The
-    /// part, the job and the cycle of `ticket` are filled in.
+    /// Returns two file names for each station: the file of measured points and the file of reference points. A station
+    /// is one place from which the part is measured. The names come from the entries in `stations`. The part, the job
+    /// and the cycle of `ticket` are filled into the names.
     ///
-    /// If both names of a station in the cell file contain a star (`*`), this entry represents several stations. There
-    /// is one station for each text in place of the star for which both files exist in `files`. These stations are in
-    /// the order of `files`.
+    /// If both names of an entry contain a star (`*`), this entry stands for several stations. The star is replaced by
+    /// each text for which both files exist in `files`. Each such text gives one station. These stations are in the
+    /// order of `files`. If only one name or no name contains a star, the entry gives one station.
     fn named_stations(
         &self,
         ticket: &HandOverHeader,
@@ -668,8 +678,9 @@ fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
     (off > 0).then(|| format!("{name}: {off} rows are marked as disabled in the file and were ignored"))
 }
 
-/// Reads a plan that was handed over from the files `plan.json` and `plan.csv` in `folder`. The field `careful_start`
-/// of the returned plan is `None`, because the files do not contain it.
+/// Reads a plan that was handed over earlier from the files `plan.json` and `plan.csv` in `folder`. These files do not
+/// contain the careful start (the slower speed for the first targets). The field `careful_start` of the returned plan
+/// is therefore `None`.
 ///
 /// # Errors
 /// Returns an error if a file cannot be read, or if somebody has changed the layout of a file.

@@ -22,9 +22,10 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
     /// hand-over cannot be read.
     fn open(&mut self) -> Result<Vec<HandOver>, ExchangeError>;
 
-    /// Publishes `request` as a hand-over in the outbox. All files of the hand-over appear at once, because a hidden
-    /// folder is renamed. `sequence` is the start number of the hand-over. `permit` can be withdrawn by the client
-    /// until the rename.
+    /// Publishes `request` in the outbox as a hand-over (a folder with the files for the machine). The files are first
+    /// written to a hidden folder. The folder is then renamed, so that all files appear at once. `job` is the job of
+    /// the request. `sequence` is the start number of the hand-over, which increases from one hand-over to the next.
+    /// `permit` allows the rename. A client that stops waiting can withdraw `permit` until the rename.
     ///
     /// # Errors
     /// Returns an error if this job and cycle were published before, if `permit` was withdrawn before the rename, or if
@@ -41,14 +42,16 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
     /// the hand-over does not exist or cannot be changed.
     fn mark(&mut self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError>;
 
-    /// Looks in the inbox for the answer to the open hand-over of `job`. Returns the answer, if it is complete and
-    /// correct, together with notes for a person. `now` is the time since the driver was created.
+    /// Checks the inbox for the answer to the open hand-over of `job`. Returns the answer, or no answer if it is
+    /// missing, incomplete or wrong. Also returns whether a person has confirmed that the machine has begun, and notes
+    /// for a person, for example which files are awaited. `now` is the time since the driver was created. See
+    /// [`PollResult`].
     fn poll(&mut self, now: Duration, job: Job) -> Result<PollResult<Self::Answer>, ExchangeError>;
 
-    /// Records that a person has confirmed a step of `job`: the machine has begun, or it has ended and the part is
-    /// clear. `_map_identity` is the SHA-256 of the correction map of the job.
+    /// Records that a person has confirmed a step of `job`. `_what` states the step: the machine has begun, or the
+    /// machine has ended and the part is clear. `_map_identity` is the SHA-256 of the correction map of the job.
     ///
-    /// The default always returns an error. It is for machines that report their jobs only by files, without a
+    /// The default always returns an error. The default is for machines that report their jobs only by files, without a
     /// confirmation by a person.
     fn confirm(&mut self, job: Job, _what: ConfirmedStep, _map_identity: [u8; 32]) -> Result<(), ExchangeError> {
         Err(ExchangeError::NotOpen { job: job.job, cycle: job.cycle })

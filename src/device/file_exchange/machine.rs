@@ -268,8 +268,9 @@ impl<M: Exchange> FolderMachine<M> {
         self.started(armed)
     }
 
-    /// Changes the status of a hand-over to stopped. It was published only after its client had stopped waiting. The
-    /// client may have continued without this hand-over, so the hand-over must not stay open.
+    /// Stops a hand-over that was published too late: the client had already stopped waiting and withdrawn its permit.
+    /// Changes the status of the hand-over to stopped. The client may have continued without this hand-over, so the
+    /// hand-over must not stay open. `armed` contains the job and the start number of the hand-over.
     ///
     /// # Errors
     /// Always returns an error: the refusal [`Answer::DeadToken`], or the error that occurred when the status was
@@ -287,13 +288,16 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(Started { job: armed.job, start_sequence: armed.start_sequence, status: self.status() })
     }
 
-    /// Decides whether a start has taken effect although the publication of its hand-over returned `error`. For this
-    /// purpose, reads the outbox again. If the outbox contains the hand-over and `permit` is not withdrawn, the start
-    /// counts as successful. If `permit` is withdrawn, the hand-over is stopped and the start is refused.
+    /// Decides whether a job has been started although the publication of its hand-over returned `error`. `armed`
+    /// contains the job and the start number of the hand-over. Reads the outbox again for this decision.
+    ///
+    /// If the outbox contains the hand-over and `permit` is not withdrawn, the start counts as successful. If the
+    /// outbox contains the hand-over and `permit` is withdrawn, stops the hand-over.
     ///
     /// # Errors
-    /// Returns `error`, as the error of this machine, if the outbox does not contain the hand-over. Returns
-    /// [`DeviceError::StartUnknown`] if the outbox cannot be read.
+    /// Returns the refusal [`Answer::DeadToken`] if the hand-over was stopped. Returns `error`, as the error of this
+    /// machine, if the outbox does not contain the hand-over. Returns [`DeviceError::StartUnknown`] if the outbox
+    /// cannot be read.
     fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError, permit: &Permit) -> DeviceResult<Started> {
         let why = self.failed(MachineCommand::Start, error);
         match self.exchange.open() {
@@ -402,9 +406,9 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(())
     }
 
-    /// Accepts the confirmation of a person about the running job: the job has begun, or it has ended and the machine
-    /// is clear of the part. `map_identity` is the SHA-256 of the correction map that the person names. Always returns
-    /// an empty list of files.
+    /// Accepts the confirmation of a step of the running job by a person. `what` states the step: the machine has
+    /// begun, or the machine has ended and is clear of the part. `map_identity` is the SHA-256 of the correction map
+    /// that the person names. Always returns an empty list of files.
     ///
     /// # Errors
     /// Returns an error if the machine is not connected, if it is a CMM, if no job runs, or if `map_identity` is not

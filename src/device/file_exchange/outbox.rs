@@ -174,15 +174,16 @@ impl Outbox {
         Ok(found)
     }
 
-    /// Returns the hand-over of a job and its cycle, or `None` if there is none.
+    /// Returns the hand-over in the outbox that has the run number and the cycle of `job`. Returns `None` if there is
+    /// no such hand-over. Returns an error if the outbox cannot be read.
     fn find(&self, job: Job) -> Result<Option<StoredHandover>, ExchangeError> {
         Ok(self.list()?.into_iter().find(|l| (l.header.job, l.header.cycle) == (job.job, job.cycle)))
     }
 
-    /// Returns the hand-over of a job and its cycle.
+    /// Returns the hand-over in the outbox that has the run number and the cycle of `job`.
     ///
     /// # Errors
-    /// There is none, or the outbox cannot be read.
+    /// Returns an error if there is no such hand-over, or if the outbox cannot be read.
     pub(super) fn handed_over(&self, job: Job) -> Result<StoredHandover, ExchangeError> {
         self.find(job)?.ok_or_else(|| ExchangeError::Missing { folder: self.folder.clone() })
     }

@@ -5,7 +5,9 @@
 pub struct Pattern(String);
 
 impl Pattern {
-    /// Creates a pattern from its text: `*` matches any characters, `{part}`, `{job}` and `{cycle}` are placeholders.
+    /// Creates a pattern for file names from `text`. In `text`, a star (`*`) matches any characters. The words
+    /// `{part}`, `{job}` and `{cycle}` are placeholders for the name of the part, the number of the job and the number
+    /// of the cycle.
     pub fn new(text: impl Into<String>) -> Self {
         Self(text.into())
     }

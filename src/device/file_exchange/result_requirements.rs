@@ -89,18 +89,19 @@ impl ResultRequirements<'_> {
     }
 }
 
-/// Checks a complete measurement against its plan. This is done before the measurement is accepted as the answer,
-/// because a rejected file can still be replaced. `least_found` is the fraction of the targets, from 0 to 1, that need
-/// a touched point. `rehearsal` is true if people only act as the machines; the plan itself may then be returned as the
-/// measurement. `path` is used in messages.
+/// Checks a complete measurement against its plan. Call it before the measurement is accepted, because a rejected file
+/// can still be replaced. `least_found` is the fraction of the targets, from 0 to 1, that need a touched point.
+/// `rehearsal` is true if people only act as the machines; the plan itself may then be returned as the measurement.
+/// `path` is used in messages.
 ///
 /// # Errors
-/// Returns an error in each of these cases:
+/// A measurement can be divided into several batches of touches. Returns an error in each of these cases:
 ///
-/// - Too few targets have a touched point. The first batch needs the fraction `least_found` of its targets, every
-///   further batch half of its targets.
+/// - Too few targets have a touched point. The first batch needs the fraction `least_found` of its targets. Each
+///   further batch needs half of its targets.
 /// - The points are equal to the points of the plan, and `rehearsal` is false.
-/// - The points do not lie at their targets.
+/// - After a rigid best fit of all touched points of the part to their targets, a point is too far from its target, or
+///   the rotation of the fit is too large.
 pub fn check_measurement(
     path: &Path,
     plan: &Plan,
@@ -124,9 +125,10 @@ pub fn check_measurement(
     }
 }
 
-/// Builds a measurement from its points and from the headers of its result files. The probe radius and the temperature
-/// come from the first file that states them; they are `None` if no file states them. `done` is the number of the START
-/// command that began the measurement. The duration is `None`.
+/// Builds a measurement from its `points` and from the headers of its result files `results`. The probe radius and the
+/// temperature come from the first file that states them; they are `None` if no file states them. `plan_identity` is
+/// the SHA-256 of the plan. `done` is the number of the START command that began the measurement. The measurement keeps
+/// this number for its acknowledgement. The duration is `None`.
 pub fn assemble_measurement(
     points: Vec<MeasuredPoint>,
     results: &[ResultFile],

@@ -149,8 +149,8 @@ impl MeasurementSession {
         }
     }
 
-    /// Rejects the incomplete line `text`, whose end did not arrive in time. A running measurement then holds, because
-    /// the touch may be lost.
+    /// Rejects the incomplete line `text`, whose end did not arrive in time. A measurement in the state EXECUTE then
+    /// changes to HOLDING, because the touch in this line may be lost.
     pub(super) fn cut_short(&mut self, text: &str) {
         self.reject_line(text, "the line is incomplete, because its end did not arrive: touch this point again");
     }
@@ -267,9 +267,13 @@ impl MeasurementSession {
 
     // ---- words ------------------------------------------------------------------------------------------------------------------------
 
-    /// Returns notes for a person about received lines that were not used. The notes contain the last refused lines (at
-    /// most four) and the lines that arrived without a requested measurement. When all targets are touched, they also
-    /// contain the number of lines that arrived twice.
+    /// Returns notes for the operator about received lines that were not used:
+    ///
+    /// - The last refused lines, at most four.
+    /// - The number of lines that arrived twice, if all targets are touched.
+    /// - The last line that arrived while no measurement was requested, with the line formats that match it.
+    ///
+    /// Returns an empty list if there are no such lines.
     pub(super) fn refusals(&self) -> Vec<String> {
         let asked = self.measurement.as_ref();
         let refused = asked.into_iter().flat_map(|asked| asked.refused_lines.iter().cloned());

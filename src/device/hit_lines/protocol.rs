@@ -53,19 +53,20 @@ impl LineFormat {
         (Self::LetteredIntegerRotary, "lettered-integer-rotary"),
     ];
 
-    /// Returns true if the numbers of a line are integers: coordinates in micrometres and angles in tenths of a degree.
+    /// Returns true if a line in this format contains integers: coordinates in micrometres and angles in tenths of a
+    /// degree. Returns false if a line contains decimal numbers in millimetres and degrees.
     pub fn is_integer(self) -> bool {
         use LineFormat::*;
         matches!(self, Integer | LetteredInteger | IntegerRotary | LetteredIntegerRotary)
     }
 
-    /// Returns true if each number of a line begins with the letter of its axis.
+    /// Returns true if each number of a line in this format begins with the letter of its axis, for example `X100.000`.
     pub fn is_lettered(self) -> bool {
         use LineFormat::*;
         matches!(self, LetteredDecimal | LetteredInteger | LetteredDecimalRotary | LetteredIntegerRotary)
     }
 
-    /// Returns true if a line has a fourth value, the angle of a rotary table.
+    /// Returns true if a line in this format has a fourth value, the angle of a rotary table.
     pub fn has_rotary(self) -> bool {
         use LineFormat::*;
         matches!(self, DecimalRotary | IntegerRotary | LetteredDecimalRotary | LetteredIntegerRotary)

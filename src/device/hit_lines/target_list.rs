@@ -74,14 +74,17 @@ impl TargetList {
         self.expected_mm.is_empty()
     }
 
-    /// Assigns the point `at_mm` to the nearest target and stores the point. `at_mm` is the position in `line`, in mm.
-    /// `came` is the time from the start of the measurement to the arrival of the line. An identical line that follows
-    /// the previous line within `double_within` is reported as a duplicate and not stored. If the list accepts any
-    /// points, stores every other point with the next index.
+    /// Assigns the point `at_mm` to the nearest target and stores the point. `at_mm` is the position in the received
+    /// line `line`, in mm. `came` is the time from the start of the measurement to the arrival of this line. Returns
+    /// the index of the target, and whether this is its first touch or a replacement.
+    ///
+    /// If the same line as the previous one arrives within the time `double_within` of the touch rules, returns
+    /// `TouchAssignment::DuplicateLine` and stores nothing. If the list has no targets and accepts every point, stores
+    /// the point with the next free index.
     ///
     /// # Errors
-    /// Returns the reason as text if the nearest target is farther away than `limit_mm`, or if that target was already
-    /// touched and the rules do not allow replacement.
+    /// Returns the reason as text if the nearest target is farther away than `limit_mm` of the touch rules. Also
+    /// returns the reason if that target was already touched and the touch rules do not allow replacement.
     pub(super) fn assign(&mut self, line: &str, at_mm: [f64; 3], came: Duration) -> Result<TouchAssignment, String> {
         let before = self.last.replace((line.to_owned(), came));
         let within = |at: Duration| came.saturating_sub(at) < self.rules.double_within;
@@ -139,8 +142,9 @@ impl TargetList {
         self.indices.iter().zip(&self.points).filter(|(_, point)| point.is_none()).map(|(index, _)| *index)
     }
 
-    /// Returns one point for each target, in the order of the plan. A target that was not touched has the status
-    /// `NotFound`. If the list accepts any points, returns them in the order in which they arrived.
+    /// Returns one point for each target, in the order of the plan. A target that was not touched has a point with the
+    /// status `NotFound`. If the list has no targets and accepts every point, returns the received points in the order
+    /// of their arrival.
     pub(super) fn points(&self) -> Vec<MeasuredPoint> {
         let missed = |k: usize| MeasuredPoint {
             index: self.indices.get(k).copied().unwrap_or_default(),
@@ -151,9 +155,8 @@ impl TargetList {
         self.points.iter().enumerate().map(|(k, point)| point.unwrap_or_else(|| missed(k))).collect()
     }
 
-    /// Returns the measured points that follow each other without a gap: from the target at position `from` of the plan
-    /// to the last target before the first untouched one. Returns an empty list if the target at `from` is not touched
-    /// yet.
+    /// Returns the touched points from position `from` of the plan up to the first target that is not touched yet. That
+    /// target and all later targets are left out. Returns an empty list if the target at `from` is not touched yet.
     pub(super) fn ready(&self, from: usize) -> Vec<MeasuredPoint> {
         self.points.iter().skip(from).map_while(|point| *point).collect()
     }

@@ -198,8 +198,9 @@ fn transformation(items: &[Item]) -> Result<(), SyntaxError> {
     }
 }
 
-/// Checks the properties `items` of a command. `fits` receives the name of a property and the items in its parentheses,
-/// and returns true if the command allows this property.
+/// Checks that the arguments `items` of a command are properties. A property is a name with items in parentheses, for
+/// example `X(1.5)`. `fits` receives the name of a property and the items in its parentheses. It returns true if the
+/// command allows this property.
 ///
 /// # Errors
 /// Returns error 502 if `items` is empty, if an item is not a property, if `fits` returns false for an item, or if a
@@ -254,9 +255,9 @@ fn touch(items: &[Item]) -> Result<(), SyntaxError> {
 
 // ---- properties of tools --------------------------------------------------------------------------------------------------------
 
-/// Returns the error with which a server refuses `items`; never returns `Ok`. If the last two items are a name and an
-/// empty item (as in `X,`), returns error 509, because the name is a property without parentheses. For all other items,
-/// returns the error `otherwise`.
+/// Returns the error with which a server refuses the invalid arguments `items`. The result is always `Err`. If `items`
+/// ends with a name and an empty item (as in `X,`), the error is 509: the name is a property whose parentheses are
+/// missing. For all other `items`, the error is `otherwise`.
 fn trailing(items: &[Item], otherwise: SyntaxError) -> Result<(), SyntaxError> {
     match items {
         [.., Item::Name(_), Item::Nothing] => Err(bad("a property ends with its parentheses")),

@@ -121,9 +121,10 @@ pub(super) struct Worker {
 }
 
 impl Worker {
-    /// Carries out the orders of the driver until the connection fails or until the driver closes the order channel.
-    /// Checks in idle intervals that the server answers. An abort interrupts a running order. If the order channel was
-    /// closed, also ends the session at the server.
+    /// Executes the orders of the driver, one after the other. While no order arrives, asks the server at regular
+    /// intervals whether it still answers. Interrupts a running order if an abort is ordered. Returns when the
+    /// connection fails or when the driver closes the channel of orders. In the second case, first ends the session at
+    /// the server.
     pub(super) async fn serve_session(mut self) {
         loop {
             let done = tokio::select! {
@@ -173,9 +174,9 @@ impl Worker {
         }
     }
 
-    /// Stores `failure` in the shared state. The state becomes ABORTED after an abort, and FAULTED after a refused
-    /// command or an implausible answer. Returns true if the connection failed, which means that the session is lost;
-    /// otherwise returns false.
+    /// Stores `failure` in the shared state. After an abort, the state becomes ABORTED. After a refused command or an
+    /// implausible answer, the state becomes FAULTED. After a failed connection, the state stays the same and the error
+    /// is stored as the end of the session. Returns true if the connection failed, otherwise false.
     fn failed(&mut self, failure: Failure) -> bool {
         let why = self.device_error(&failure);
         self.position_mm = None;
@@ -263,7 +264,11 @@ impl Worker {
         Ok(())
     }
 
-    /// Rises to the clearance height and fails the job: too many targets could not be reached.
+    /// Raises the probe to the clearance height and then returns a failure. The failure states that too many targets
+    /// could not be reached; `unreached` is their number.
+    ///
+    /// # Errors
+    /// Always returns a failure. If the upward motion fails, returns the failure of this motion instead.
     async fn fail_unreachable(&mut self, work: &RoutedPlan, unreached: u32) -> Result<(), Failure> {
         self.rise(work).await?;
         let text = format!("{unreached} targets could not be reached: check the position of the part");
@@ -343,8 +348,12 @@ impl Worker {
         }
     }
 
-    /// Compares the tool radius that the server reports with the probe radius of the plan. Returns an error if they
-    /// differ by more than `probe_tolerance_mm`. If the server reports no tool radius, only adds a note.
+    /// Compares the tool radius that the server reports with the probe radius of the plan. If the server cannot report
+    /// a tool radius, adds a note for the operator and returns `Ok`.
+    ///
+    /// # Errors
+    /// Returns a failure if the two radii differ by more than `probe_tolerance_mm`, if the reported value is missing,
+    /// or if the request fails.
     async fn check_tool_radius(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         let told = self.request_if_supported("GetProp", vec![Item::property_query("Tool.AvrRadius")]).await?;
         let Some(told) = told else {
@@ -368,13 +377,13 @@ impl Worker {
         Err(Failure::Implausible(DeviceError::ProbeRadius { machine, tool, reported_mm: told_mm, plan_mm, limit_mm }))
     }
 
-    /// Sets parameters of the tool, then reads them back. `parameters` contains names without the prefix `Tool.`, each
-    /// with its requested value. Returns the values that the server now uses, in the same order. If the server uses a
-    /// lower speed than requested, accepts the lower speed and adds a note.
+    /// Sets parameters of the tool at the server, then reads the values back. `parameters` contains names without the
+    /// prefix `Tool.`, each with its requested value. Returns the values that the server now uses, in the same order.
+    /// If the server uses a lower speed than requested, accepts this speed and adds a note for the operator.
     ///
     /// # Errors
-    /// Returns a failure if any other value differs from the request, if a value is missing in the answer, or if the
-    /// server refuses the parameters.
+    /// Returns a failure if any other value differs from the request, if a value is missing in the answer, if the
+    /// server refuses the parameters, if an abort is ordered, or if the connection fails.
     pub(super) async fn set(&mut self, parameters: &[(&str, f64)]) -> Result<Vec<f64>, Failure> {
         let named = |name: &str| format!("Tool.{name}");
         let wanted = parameters.iter().map(|(name, value)| Item::property(&named(name), *value)).collect();
@@ -406,8 +415,13 @@ impl Worker {
         Ok(in_force)
     }
 
-    /// Sets the travel and touch speeds for target number `k`, if they differ from the speeds in force. The first
-    /// targets of a careful start have a lower speed.
+    /// Sets the travel speed and the touch speed for the target with index `k` in the plan. Sends nothing if the server
+    /// already uses these speeds. The plan can have a careful start: its first targets are then approached and touched
+    /// at a lower speed.
+    ///
+    /// # Errors
+    /// Returns a failure if the server refuses the speeds or uses a higher speed than requested, if an abort is
+    /// ordered, or if the connection fails.
     pub(super) async fn set_speeds(&mut self, work: &RoutedPlan, k: usize) -> Result<(), Failure> {
         let careful = work.plan.careful_start.filter(|careful| k < careful.target_count as usize);
         let touching = careful.map_or(work.plan.speed_mm_s, |careful| careful.speed_mm_s);
@@ -456,10 +470,13 @@ impl Worker {
         Ok(MeasuredPoint { index: target.index, status: missed, quality: 100, position_mm: [0.0; 3] })
     }
 
-    /// Returns the measured point in the answer to a touch.
+    /// Converts `answer`, the reply of the server to a touch of `target`, to the measured point. Uses the three
+    /// coordinates of the probe's centre, and the quality if the server reports it. Stores the approach point of the
+    /// target as the present position of the probe.
     ///
     /// # Errors
-    /// A coordinate is missing, the tool radius is not that of the plan, or the point is too far from its target.
+    /// Returns a failure if a coordinate is missing, if the reported tool radius is not that of the plan, or if the
+    /// point is too far from its target.
     fn point(
         &mut self,
         work: &RoutedPlan,
@@ -502,9 +519,12 @@ impl Worker {
         Err(Failure::Implausible(DeviceError::OutOfRange { machine, field, value: off_mm, min: 0.0, max: most, unit }))
     }
 
-    /// Moves the probe to the approach point of `target` in three steps: up to the clearance height, horizontally until
-    /// the probe is above the approach point, and down to the approach point. The approach point lies on the normal of
-    /// the target; the touch begins there.
+    /// Moves the probe to the approach point of `target`. This point lies on the normal of the target; the touch begins
+    /// there. The probe moves in three steps: up to the clearance height, horizontally until it is above the approach
+    /// point, and down to the approach point.
+    ///
+    /// # Errors
+    /// Returns a failure if the server refuses a motion, if an abort is ordered, or if the connection fails.
     pub(super) async fn move_above(&mut self, work: &RoutedPlan, target: &PlanTarget) -> Result<(), Failure> {
         self.rise(work).await?;
         let [x, y, z] = approach(target, &work.plan);
@@ -513,7 +533,10 @@ impl Worker {
     }
 
     /// Moves the probe straight up to the clearance height of the route. Does nothing if the probe is already at this
-    /// height or higher, or if its position is unknown.
+    /// height or higher, or if the position of the probe is unknown.
+    ///
+    /// # Errors
+    /// Returns a failure if the server refuses the motion, if an abort is ordered, or if the connection fails.
     pub(super) async fn rise(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         let Some([x, y, z]) = self.position_mm else { return Ok(()) };
         let clearance_mm = work.route.clearance_mm;
@@ -555,7 +578,13 @@ impl Worker {
         Ok(())
     }
 
-    /// Sends a request that not every server supports. Returns `None` if this server does not support it.
+    /// Sends the command `name` with `arguments` to the server and returns the reply. Not every server supports this
+    /// command. If the server refuses it as unknown or not supported, adds a note for the operator, clears the errors
+    /// of the server and returns `None`.
+    ///
+    /// # Errors
+    /// Returns a failure if the server refuses the command for another reason, if an abort is ordered, or if the
+    /// connection fails.
     pub(super) async fn request_if_supported(
         &mut self,
         name: &str,
@@ -569,7 +598,13 @@ impl Worker {
     }
 }
 
-/// Sends a request that not every server supports. Returns `None` if this server does not support it.
+/// Sends the command `name` with `arguments` on `session` and returns the reply. Not every server supports this
+/// command. If the server refuses it as unknown or not supported, adds a note for the operator, clears the errors of
+/// the server and returns `None`.
+///
+/// # Errors
+/// Returns a failure if the server refuses the command for another reason, if an abort is ordered, or if the connection
+/// fails.
 pub(super) async fn request_if_supported(
     session: &mut Session,
     name: &str,
@@ -586,8 +621,9 @@ pub(super) async fn request_if_supported(
     }
 }
 
-/// Returns the number of a warning in `answer` which states that a touch met no surface or an obstacle. Some servers
-/// report a missed touch only as such a warning. Returns `None` if the answer contains data or no such warning.
+/// Returns the error number of a missed touch, if `answer` reports the miss only as a warning. Some servers do this. A
+/// touch is missed if the probe finds no surface or meets an obstacle. Returns `None` if `answer` contains data or has
+/// no such warning.
 fn missed_by(answer: &CommandReply) -> Option<u16> {
     let numbers = answer.warnings.iter().map(|warning| warning.number);
     numbers.into_iter().find(|number| MISS_ERRORS.contains(number)).filter(|_| answer.data.is_empty())
@@ -601,7 +637,8 @@ pub(super) fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Returns the machine fault for an error number of the I++ DME standard. Severity and text of the error do not matter.
+/// Converts `number`, an error number of the I++ DME standard, to a machine fault. Returns [`Fault::Other`] with the
+/// number if no special fault belongs to it.
 fn fault(number: u16) -> Fault {
     match number {
         500 => Fault::StopCircuit,

@@ -82,14 +82,15 @@ pub(super) struct CommandReply {
 }
 
 impl CommandReply {
-    /// Returns the number of the property `name`. Returns `None` if the answer does not have exactly one line of data
-    /// that contains the property once.
+    /// Returns the number in the property `name` of this reply, for example 1.5 for `X` in `X(1.5)`. Identical lines of
+    /// data count as one line. Returns `None` if the reply has no data or lines that differ. Also returns `None` if the
+    /// line does not contain the property exactly once with exactly one number.
     pub(super) fn value(&self, name: &str) -> Option<f64> {
         value(self.line()?, name)
     }
 
-    /// Returns the only line of data; identical repeated lines count as one. `None` if there is no line, or if lines
-    /// differ.
+    /// Returns the items of the only line of data in this reply. Identical lines count as one line. Returns `None` if
+    /// the reply has no line of data, or if its lines differ.
     pub(super) fn line(&self) -> Option<&[Item]> {
         let (first, rest) = self.data.split_first()?;
         rest.iter().all(|other| other == first).then_some(first)
@@ -191,19 +192,20 @@ impl Session {
         Ok(())
     }
 
-    /// Sends a command that causes no motion, and waits until the server has completed it.
+    /// Sends the command `name` with `arguments`, which must cause no motion. Waits until the server has completed the
+    /// command, and returns the reply.
     ///
     /// # Errors
-    /// The server refuses the command, an abort was ordered, or the connection fails.
+    /// Returns a failure if the server refuses the command, if an abort is ordered, or if the connection fails.
     pub(super) async fn ask(&mut self, name: &str, arguments: Vec<Item>) -> Result<CommandReply, Failure> {
         self.request_motion(name, arguments, Duration::ZERO).await
     }
 
-    /// Sends a command that causes a motion, and waits until the server has completed it. `motion` is the maximum
-    /// duration of the motion.
+    /// Sends the command `name` with `arguments`, which causes a motion. `motion` is the maximum duration of this
+    /// motion. Waits until the server has completed the command, and returns the reply.
     ///
     /// # Errors
-    /// The server refuses the command, an abort was ordered, or the connection fails.
+    /// Returns a failure if the server refuses the command, if an abort is ordered, or if the connection fails.
     pub(super) async fn request_motion(
         &mut self,
         name: &str,
@@ -293,11 +295,12 @@ impl Session {
         Ok(None)
     }
 
-    /// Processes a line with another tag than that of the pending command: an unsolicited message of the server, or a
-    /// late line of a finished command.
+    /// Processes `response`, a line whose tag is not that of the pending command. If the line is an unsolicited message
+    /// of the server, stores its data or its warning as a note for the operator. If the line is a late answer to an
+    /// earlier command, ignores it.
     ///
     /// # Errors
-    /// The message is an error that stops the machine, or the tag was never sent.
+    /// Returns a failure if the message is an error that stops the machine, or if the tag was never sent.
     fn process_other_line(&mut self, response: DmeResponse) -> Result<(), Failure> {
         match (response.tag, response.content) {
             (Tag::UNSOLICITED, ResponseContent::Error(error)) if !is_harmless(&error) => Err(Failure::Refused(error)),
@@ -378,8 +381,13 @@ impl Session {
         self.clear_errors(CLEARING_TRIES).await
     }
 
-    /// Sends AbortE and waits until the server has completed it. With `may_refuse`, an error answer is accepted,
-    /// because a server without a session may have nothing to abort.
+    /// Sends the command AbortE and waits until the server has completed it. If `may_refuse` is true, ignores an error
+    /// that the server reports for AbortE: a server without a session may have nothing to abort.
+    ///
+    /// # Errors
+    /// Returns a failure if the connection fails, or if the server does not complete the command within the time limit
+    /// `limits.abort`. If `may_refuse` is false, also returns a failure if the server reports an error for AbortE that
+    /// is more than a warning.
     async fn send_abort(&mut self, may_refuse: bool) -> Result<(), Failure> {
         let (command, tag) = (DmeCommand::new("AbortE", Vec::new()), self.next_event());
         self.write(&command, tag).await.map_err(Failure::Link)?;

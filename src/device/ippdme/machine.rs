@@ -157,11 +157,13 @@ impl IppdmeCmm {
         })
     }
 
-    /// Checks the machine class that the server reports against the cell file.
+    /// Checks `class`, the machine class that the server reports, against the settings of the cell file.
     ///
     /// # Errors
-    /// The class is of a simulated machine and the cell file of a real one, or the reverse, or it is not the expected
-    /// name.
+    /// Returns an error in each of these cases:
+    ///
+    /// - The machine is simulated and the cell is not, or the reverse.
+    /// - The cell file states an expected name, and `class` differs from it.
     fn check_identity(&self, class: &str) -> DeviceResult<()> {
         let machine = || Arc::clone(&self.name);
         let simulation = class.contains(SIMULATED);

@@ -44,9 +44,11 @@ pub(super) struct Route {
 
 impl Route {
     /// Finds a route of the probe to all targets of `plan`. `volume_mm` contains the minimum and the maximum corner of
-    /// the box that the probe's centre must not leave, in mm. `machine` is the name of the machine in errors. If `scan`
-    /// is given, rows of at least four targets are scanned; the distance between successive targets of a row is at most
-    /// `scan.step_mm`. Without rows, every target is touched in an order that shortens the travel.
+    /// the box that the probe's centre must not leave, in mm. `machine` is the name of the machine in errors.
+    ///
+    /// If `scan` is given, successive targets can form a row. The distance between neighbours in a row is at most
+    /// `scan.step_mm`. Rows of at least four targets are scanned, and the route keeps the order of the plan. If `scan`
+    /// is `None` or no row is long enough, every target is touched, in an order that shortens the travel.
     ///
     /// # Errors
     /// Returns an error if the normal of a target points too far down to touch the target from above, or if a position
@@ -73,7 +75,8 @@ impl Route {
 }
 
 impl Leg {
-    /// Returns the range of plan indices of the targets that this leg measures.
+    /// Returns the range of plan indices of the targets that this leg measures. A leg is one part of the route: a touch
+    /// of one target, or a scan of several successive targets.
     pub(super) fn targets(&self) -> Range<usize> {
         match self {
             Self::Touch(k) => *k..k + 1,
@@ -82,9 +85,12 @@ impl Leg {
     }
 }
 
-/// Splits `plan` into scans (rows of targets) and single touches, in the order of the plan. The first targets of a
-/// careful start, the targets on the reference sphere, and the targets in rows of fewer than four targets become single
-/// touches.
+/// Splits `plan` into scans (rows of targets) and single touches, in the order of the plan. These targets become single
+/// touches:
+///
+/// - The first targets of a careful start, which are measured at a lower speed.
+/// - The targets on the reference sphere.
+/// - The targets in rows of fewer than four targets.
 fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
     let careful = plan.careful_start.map_or(0, |careful| careful.target_count as usize).min(plan.targets.len());
     let mut legs: Vec<Leg> = (0..careful).map(Leg::Touch).collect();
@@ -173,9 +179,10 @@ fn check(
     Ok(())
 }
 
-/// Returns an order of the targets that shortens the travel, as indices into the plan. The first targets of a careful
-/// start stay first. Targets on the part and targets on the reference sphere are not mixed. Returns the plan's own
-/// order if the plan has more than 6000 targets.
+/// Returns an order of the targets that shortens the travel, as indices into the plan. If the plan has a careful start
+/// (first targets that are measured at a lower speed), these targets stay first and keep their order. Targets on the
+/// part and targets on the reference sphere are not mixed. Returns the order of the plan if the plan has more than 6000
+/// targets.
 fn order(plan: &Plan) -> Vec<usize> {
     let mut order: Vec<usize> = (0..plan.targets.len()).collect();
     if plan.targets.len() > MAX_ORDERED {
@@ -374,7 +381,8 @@ impl<'a> Tour<'a> {
     }
 }
 
-/// Returns the indices of the 10 positions nearest to position `of`, nearest first.
+/// Returns the indices of the 10 other positions in `places` that are nearest to the position with index `of`, nearest
+/// first. Returns fewer indices if there are fewer than 10 other positions.
 fn neighbours(places: &[[f64; 2]], of: usize) -> Vec<usize> {
     const NEAR: usize = 10;
     let mut others: Vec<usize> = (0..places.len()).filter(|k| *k != of).collect();

@@ -21,9 +21,13 @@ use crate::payload::{MeasuredPoint, Plan, PlanTarget, TouchStatus};
 const STRAIGHT_MM: f64 = 1e4;
 
 impl Worker {
-    /// Configures the server for scanning: the scan speed, the retract distance, and one point at each target. Does
-    /// nothing if the cell file has no scanning, or if the server reports no radius of its tool: then the targets are
-    /// touched one by one.
+    /// Configures the server for scanning: sets the scan speed and the retract distance, and requests exactly one point
+    /// at each target. Does nothing if the cell file does not configure scanning. Adds only a note for the operator if
+    /// the server reports no tool radius; the targets are then touched one by one.
+    ///
+    /// # Errors
+    /// Returns a failure if the server refuses a setting or uses another value, if an abort is ordered, or if the
+    /// connection fails.
     pub(super) async fn set_up_scans(&mut self, work: &RoutedPlan) -> Result<(), Failure> {
         let Some(scan) = self.settings.scan else { return Ok(()) };
         if locked(&self.shared).radius_mm.is_none() {
@@ -125,12 +129,16 @@ impl Worker {
             .collect())
     }
 
-    /// Checks the scanned positions `places`, in mm, one for each of `targets`. Each position must pass the distance
-    /// check of a single touch. In addition, its distance from the normal line of its target must not exceed half of
-    /// the distance between this target and the nearest adjacent target of the row.
+    /// Checks the scanned positions `places` of the probe's centre, in mm, one for each of `targets`. Each position
+    /// must meet two conditions:
+    ///
+    /// - Its distance from the expected position of the probe's centre is at most the sum of the approach distance, the
+    ///   search distance and `probe_tolerance_mm`.
+    /// - Its distance from the line through its target along the normal is at most half of the distance between this
+    ///   target and the nearest adjacent target of the row.
     ///
     /// # Errors
-    /// Returns a failure for the first position that is too far away.
+    /// Returns a failure for the first position that does not meet a condition.
     fn check_row(&self, work: &RoutedPlan, targets: &[PlanTarget], places: &[[f64; 3]]) -> Result<(), Failure> {
         for (k, (target, at_mm)) in targets.iter().zip(places).enumerate() {
             self.check_touch_position(work, target, *at_mm)?;
@@ -153,8 +161,8 @@ fn is_missed(error: &ServerError) -> bool {
     MISS_ERRORS.contains(&error.number)
 }
 
-/// Returns the arguments that scan the open curve through these targets. Each target has its point, its normal and the
-/// number 1, which marks a point on the surface.
+/// Returns the arguments of the I++ DME command `ScanOnCurve` for an open curve through `targets`. The arguments
+/// contain for each target the point in mm, the normal, and the number 1, which marks a point on the surface.
 fn curve(targets: &[PlanTarget]) -> Vec<Item> {
     let call = |name: &str, items: Vec<Item>| Item::Call(name.to_owned(), items);
     let mut format = ["X", "Y", "Z", "IJK"].map(Item::property_query).to_vec();

@@ -171,7 +171,11 @@ impl<'a> Reader<'a> {
         after.is_some()
     }
 
-    /// Parses items up to the closing parenthesis, which is consumed. The opening one must have been consumed before.
+    /// Parses the items up to the next closing parenthesis, and consumes this parenthesis. The caller must have
+    /// consumed the opening parenthesis before. Returns an empty list if nothing is between the parentheses.
+    ///
+    /// # Errors
+    /// Returns an error if an item is invalid, or if the closing parenthesis is missing.
     pub(super) fn in_parentheses(&mut self) -> Result<Vec<Item>, SyntaxError> {
         if self.eat(')') {
             return Ok(Vec::new());

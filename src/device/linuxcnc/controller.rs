@@ -117,8 +117,12 @@ impl Controller {
         }
     }
 
-    /// Reads the complete state of the controller. Reads its errors only if `errors` is true, because the controller
-    /// reports each error to only one client.
+    /// Reads the complete state of the controller and returns it. If `errors` is true, also reads the error messages.
+    /// The controller reports each message only once and to only one client. If `errors` is false, the list of messages
+    /// in the result is empty.
+    ///
+    /// # Errors
+    /// Returns an error if the connection fails or if an answer is not valid.
     pub(super) async fn read_state(&mut self, errors: bool) -> DeviceResult<ControllerState> {
         const WHAT: [Get; 9] = [
             Get::Enable,
@@ -202,8 +206,11 @@ impl Controller {
         }
     }
 
-    /// Sends an order and waits for its acknowledgement, which means that the order was received, not that it
-    /// succeeded. `command` is the name of the order in errors.
+    /// Sends the order `set` to the controller and waits for its acknowledgement. The acknowledgement means only that
+    /// the order was received, not that it succeeded. `command` is the name of the order in errors.
+    ///
+    /// # Errors
+    /// Returns an error if the controller refuses the order, if another client has control, or if the connection fails.
     pub(super) async fn order(&mut self, set: Set, command: MachineCommand) -> DeviceResult<()> {
         let asked = self.link("an order")?.ask(RshRequest::Set(set), self.settings.answer_timeout);
         let answer = asked.answer().await;
@@ -247,11 +254,13 @@ impl Controller {
         Ok(())
     }
 
-    /// Aborts, whichever client has control. Sends the line that takes control and the line that aborts together,
-    /// without waiting between them.
+    /// Aborts the program of the controller, even if another client has control. Sends two orders directly after each
+    /// other: one takes control, the other aborts. Sends the second order without waiting for the answer to the first,
+    /// then waits for both answers.
     ///
     /// # Errors
-    /// The password for control is wrong, or the controller does not acknowledge the abort.
+    /// Returns an error if the password for control is wrong, if the controller does not acknowledge the abort, or if
+    /// the connection fails.
     pub(super) async fn abort(&mut self) -> DeviceResult<()> {
         let enable = Set::Enable { password: self.settings.control_password.clone() };
         let within = self.settings.answer_timeout;

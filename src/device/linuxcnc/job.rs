@@ -56,7 +56,8 @@ pub(super) enum Verdict {
 }
 
 impl ActiveJob {
-    /// Returns the content of a log file if it has the token of this job; otherwise `None`.
+    /// Returns `record`, the content of a log file, if it belongs to this job. It belongs to this job if it contains
+    /// the token (the random number) of the preparation of this job. Otherwise returns `None`.
     pub(super) fn own_record(&self, record: Option<ProgramRecord>) -> Option<ProgramRecord> {
         record.filter(|record| record.token == Some(self.token))
     }
@@ -107,9 +108,11 @@ impl ActiveJob {
         }
     }
 
-    /// Returns the progress of the job over all rounds (repetitions of the pass) as `(done, total)`, both in
-    /// thousandths of a round. `line` is the line number that the controller reports. Counts a new round if `line` is
-    /// far before the previous line number. Returns `None` if the program is not known.
+    /// Returns the progress of the job as `(done, total)`. A round is one run of the pass, and the job can have several
+    /// rounds. Both numbers count thousandths of a round: `total` is 1000 for each round.
+    ///
+    /// `line` is the line number that the controller reports. Counts a new round if `line` is lower than the previous
+    /// line number by more than half of the lines of the pass. Returns `None` if the program is not known.
     pub(super) fn progress(&mut self, line: u32) -> Option<(u32, u32)> {
         let program = self.program.as_ref()?;
         let (round, before) = self.round;

@@ -465,8 +465,12 @@ impl LinuxcncGrinder {
         done.map_err(|why| DeviceError::Folder { machine: self.machine(), reason: why })
     }
 
-    /// Returns the content of the log file that the program of a job wrote. Returns `None` if there is no such file, or
-    /// if its token is of another preparation.
+    /// Returns the content of the log file that the program of the job `work` wrote. Returns `None` if the program is
+    /// not known, or if there is no log file. Also returns `None` if the log file does not contain the token (the
+    /// random number) of the preparation of this job.
+    ///
+    /// # Errors
+    /// Returns an error if the log file cannot be read.
     async fn record(&self, work: &ActiveJob) -> DeviceResult<Option<ProgramRecord>> {
         let Some(name) = work.program.as_ref().map(|program| program.name.clone()) else { return Ok(None) };
         Ok(work.own_record(self.in_folders(move |folders| folders.record(&name)).await?))

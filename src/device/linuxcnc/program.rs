@@ -127,12 +127,14 @@ const END: &str = "end";
 const REPEAT: &str = "o<regrind> repeat [";
 const MAP_COMMENT: &str = "(map: sha256 ";
 
-/// Returns the path of a file in the folder at the controller, which is always a Unix system.
+/// Returns the path `folder/name.extension` of a file at the controller. `folder` is the folder of programs as the
+/// controller sees it. The separator is always `/`, because the controller is always a Unix system.
 pub(super) fn path(folder: &str, name: &str, extension: &str) -> String {
     format!("{}/{name}.{extension}", folder.trim_end_matches('/'))
 }
 
-/// Returns the lines with which a controller opens the new log file `record` and writes `token` into it.
+/// Returns three lines of G-code (log comments) for the controller. They create the new log file with the path
+/// `record`, write `token` into it as eight hexadecimal digits, and close it.
 pub(super) fn opening(record: &str, token: u32) -> [String; 3] {
     [format!("(LOGOPEN,{record})"), format!("(LOG,{PREPARED} {token:08x})"), "(LOGCLOSE)".to_owned()]
 }

@@ -65,7 +65,8 @@ impl ControllerMode {
         }
     }
 
-    /// Returns the mode with this name, in which upper and lower case are equal, or `None` for another name.
+    /// Returns the mode with the name `word`: `manual`, `auto` or `mdi`. Upper and lower case letters are treated as
+    /// equal. Returns `None` for any other name.
     pub fn from_name(word: &str) -> Option<Self> {
         [Self::Manual, Self::Auto, Self::Mdi].into_iter().find(|mode| mode.word().eq_ignore_ascii_case(word))
     }
@@ -178,15 +179,16 @@ impl RshRequest {
     }
 }
 
-/// Returns the text after `word` if the line begins with this word, otherwise `None`. Upper and lower case are equal.
+/// Returns the text that follows `word`, without blanks at its ends, if `line` begins with `word` as a complete word.
+/// Returns `None` for any other line. Upper and lower case letters are treated as equal.
 fn after<'a>(line: &'a str, word: &str) -> Option<&'a str> {
     let (head, rest) = line.split_at_checked(word.len())?;
     let ends = rest.is_empty() || rest.starts_with([' ', '\t']);
     (ends && head.eq_ignore_ascii_case(word)).then(|| rest.trim())
 }
 
-/// Parses `line` as the answer to the request `word`, which is `hello`. Returns the name and version of the server from
-/// `HELLO ACK name version`, or a refusal for `HELLO NAK`. Returns `None` for any other line.
+/// Parses `line` as the answer to the request `hello`. `word` is the name of this request. Returns the name and version
+/// of the server from `HELLO ACK name version`. Returns a refusal for `HELLO NAK`. Returns `None` for any other line.
 fn said(line: &str, word: &str) -> Option<RshReply> {
     let rest = after(line, word)?;
     match after(rest, "ack") {
@@ -210,7 +212,8 @@ pub struct LineSplitter {
 }
 
 impl LineSplitter {
-    /// Adds bytes and returns the lines completed by them. Returns `None` if a line is too long for this protocol.
+    /// Adds `bytes` to the stored incomplete line. Returns the lines that these bytes complete, without line ends and
+    /// without empty lines. Returns `None` if a line is longer than 4096 bytes, which is too long for this protocol.
     pub fn push(&mut self, bytes: &[u8]) -> Option<Vec<String>> {
         self.bytes.extend_from_slice(bytes);
         let mut lines = Vec::new();

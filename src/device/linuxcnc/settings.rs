@@ -182,9 +182,12 @@ impl DriverFactory for LinuxcncWire {
 }
 
 impl LinuxcncWire {
-    /// Returns the command that prints the path that the LinuxCNC controller executes. A simulated cell needs this path
-    /// to move its simulated wheel. A program path that contains a folder is relative to `cell_folder`. Returns `None`
-    /// if the cell file has no `executed_path`.
+    /// Returns the command that starts a helper program, from the key `executed_path` of the cell file. This program
+    /// prints the path that the LinuxCNC controller executes. A simulated cell needs the path to move its simulated
+    /// wheel.
+    ///
+    /// If the file name of the helper program contains a folder and is relative, it is relative to `cell_folder`.
+    /// Returns `None` if this key is missing or empty.
     pub fn executed_path(&self, cell_folder: &Path) -> Option<Command> {
         let (program, arguments) = self.executed_path.as_deref()?.split_first()?;
         let at = Path::new(program);
@@ -196,11 +199,15 @@ impl LinuxcncWire {
         Some(command)
     }
 
-    /// Checks the key `executed_path` and reports errors to `document`. `place` gives the table of the machine for the
-    /// messages.
+    /// Checks the key `executed_path` of the cell file and reports errors to `document`. This key contains a helper
+    /// program and its arguments; the program prints the path that the controller executes. `place` gives the table of
+    /// the machine for the messages.
     ///
-    /// A simulated cell with LinuxCNC requires this key, because its simulated wheel follows the path that the
-    /// controller executes. In a real cell the key is an error. An empty word in the key is also an error.
+    /// These cases are errors:
+    ///
+    /// - The key is missing in a simulated cell. The simulated wheel of such a cell follows this path.
+    /// - The key exists in a cell that is not simulated.
+    /// - The program or an argument in the key is an empty text.
     fn check_path(&self, place: &MachineTable<'_>, document: &mut Document) {
         let key = place.key("wire.executed_path");
         match (place.simulated, &self.executed_path) {
@@ -221,12 +228,13 @@ impl LinuxcncWire {
         }
     }
 
-    /// Checks the folder in which the controller finds its programs, and reports errors to `document`. `place` gives
-    /// the table of the machine for the messages.
+    /// Checks the path of the folder in which the controller finds its programs, and reports errors to `document`. This
+    /// is the key `programs_at_controller` or, without this key, the key `programs`. `place` gives the table of the
+    /// machine for the messages.
     ///
-    /// A path with blanks, brackets, commas, semicolons, `%`, `#` or characters outside ASCII is an error: it cannot be
-    /// part of a command to the controller or of a comment in a program. A relative path in `programs_at_controller` is
-    /// also an error.
+    /// A path with blanks, parentheses, commas, semicolons, `%`, `#` or characters outside ASCII is an error: it cannot
+    /// be part of a command to the controller or of a comment in a program. A relative path in `programs_at_controller`
+    /// is also an error.
     fn check_folder(&self, place: &MachineTable<'_>, document: &mut Document) {
         let (key, folder) = match &self.programs_at_controller {
             Some(folder) => ("wire.programs_at_controller", folder),

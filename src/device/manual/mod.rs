@@ -125,10 +125,12 @@ impl ManualMachine {
         DeviceError::NotAccepted { machine: Arc::clone(&self.name), reason: why.to_string() }
     }
 
-    /// Changes the state to `to` and returns the status.
+    /// Changes the state of the machine from one of the states in `from` to `to`. Returns the new status. `command` is
+    /// the command of the client that causes the change; the error names this command.
     ///
     /// # Errors
-    /// Refuses with [`Answer::WrongState`] if the current state is not in `from`.
+    /// Returns the refusal [`Answer::WrongState`] if the current state is not in `from`. The state then does not
+    /// change.
     fn transition(&mut self, command: MachineCommand, from: &[MachineState], to: MachineState) -> DeviceResult<Status> {
         if !from.contains(&self.state) {
             return Err(self.refused(command, Answer::WrongState));
@@ -324,8 +326,9 @@ fn batch_suffix(job: Job) -> String {
     }
 }
 
-/// Returns true if a result file with this SHA-256 is stored in a cycle folder of the run, because an earlier process
-/// accepted it.
+/// Returns true if a cycle folder of the run folder `run` contains a file named `result`, with any extension, whose
+/// content has this SHA-256. Such a file was accepted by an earlier process. Ignores the result files of later batches,
+/// for example `result-2`.
 fn is_stored_result(run: &Path, sha256: &[u8; 32]) -> bool {
     let within = |folder: &Path| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
     // The files of later batches have a suffix: see `batch_suffix`.

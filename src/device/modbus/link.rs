@@ -209,13 +209,14 @@ impl Link {
         &self.line
     }
 
-    /// Returns the statistics so far.
+    /// Returns the statistics of this line since its creation, for example the numbers of requests, timeouts and
+    /// retries, and the answer times.
     pub fn statistics(&self) -> LinkStatistics {
         *self.counters.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Ends the pause after an error early, so that the line is opened again at once. If no pause is active, the next
-    /// pause is skipped.
+    /// Ends the pause that follows an error, so that the line is opened again at once. During this pause the line stays
+    /// closed. If no pause is active, the next pause is skipped.
     pub(super) fn skip_pause(&self) {
         self.pause_skipped.notify_one();
     }
@@ -336,8 +337,10 @@ impl Connection {
         }
     }
 
-    /// Closes the connection, so that late data on it are lost. Sets the earliest time of the next opening. The pause
-    /// is random and doubles with each failure, up to [`MAX_BACKOFF`]. It is never shorter than the quarantine.
+    /// Closes the connection, so that late data on it are lost. Then sets the earliest time at which the line may be
+    /// opened again. The pause until this time is random. Its maximum doubles with each failure, up to [`MAX_BACKOFF`].
+    /// The pause is never shorter than the quarantine (the longest time that a machine on the line may need for an
+    /// answer).
     fn drop_connection(&mut self) {
         self.connection = None;
         self.failures = self.failures.saturating_add(1);
@@ -515,7 +518,10 @@ impl Connector for SystemConnector {
     }
 }
 
-/// Discards received data until the serial line has been silent for `silence`.
+/// Discards received data until nothing has arrived on the serial line `port` for the time `silence`.
+///
+/// # Errors
+/// Returns an error if data still arrive after 2 s, or if the connection ends or fails.
 async fn drain(port: &mut dyn LineStream, silence: Duration) -> io::Result<()> {
     let until = Instant::now() + MAX_DRAIN_TIME;
     let mut bytes = [0; 256];

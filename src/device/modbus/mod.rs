@@ -285,9 +285,11 @@ impl ModbusMachine {
         Ok(status)
     }
 
-    /// Checks that this client is still the owner of the machine. If another client owns the machine, this client does
-    /// not notice the commands of the other client. Returns `Ok` if this client has not claimed the machine. The states
-    /// ABORTING and ABORTED are always accepted, because every client may abort.
+    /// Checks in `status` that this client is still the owner of the machine. The check is necessary because this
+    /// client does not notice the commands of another owner. Returns `Ok` in these cases too:
+    ///
+    /// - This client has not claimed the machine.
+    /// - The state is ABORTING or ABORTED, because every client may abort.
     ///
     /// # Errors
     /// Returns [`DeviceError::OwnedByOther`] if another client has become the owner.
@@ -299,12 +301,12 @@ impl ModbusMachine {
         Err(DeviceError::OwnedByOther { machine: self.machine(), ours: self.owner, owner: status.owner })
     }
 
-    /// Reads the additional signal with the index `k` in the cell file. Returns its value in the unit of the signal,
-    /// with its range. The value is `None` if the machine answers with a Modbus exception or the value is not finite;
-    /// then a cause is given.
+    /// Reads the additional signal with the index `k` in the cell file. Returns the value in the unit of the signal,
+    /// together with the name, the unit and the allowed range from the cell file. If the machine answers with a Modbus
+    /// exception, the value is `None` and the result contains the cause. The value is also `None` if it is not finite.
     ///
     /// # Errors
-    /// The request fails for another reason, for example without an answer.
+    /// Returns an error if the request fails for another reason, for example because no answer arrives.
     async fn signal(&mut self, k: usize) -> Result<SignalValue, DeviceError> {
         let signal = self.signals[k].clone();
         let ask = LinkRequest::Read { address: signal.address, count: signal.kind.registers() };
@@ -513,12 +515,16 @@ impl ModbusMachine {
         self.run_command(MachineCommand::Release).await
     }
 
-    /// Commands the machine to end the job at once. Returns the status that acknowledges this. Opens a lost connection
-    /// without the pause that follows an error.
+    /// Commands the machine to end the job at once. Returns the status that acknowledges this command. If the
+    /// connection is lost, opens it at once, without the pause that usually follows an error.
     ///
-    /// If the machine does not acknowledge the command, another client may have used higher sequence numbers. Then this
-    /// function returns the status if the machine already aborts. Otherwise it repeats the command with a number above
-    /// the last acknowledged one.
+    /// If the machine does not acknowledge the command, another client may have used higher sequence numbers. This
+    /// function then reads the status. If the state is ABORTING or ABORTED, returns this status. Otherwise sends the
+    /// abort again with a number above the last acknowledged number.
+    ///
+    /// # Errors
+    /// Returns an error if the connection cannot be opened, if a request fails, or if the machine refuses or does not
+    /// acknowledge the command.
     async fn abort(&mut self) -> Result<StatusBlock, DeviceError> {
         self.unit.link.skip_pause();
         if self.unit.identity().is_none() {
@@ -855,12 +861,14 @@ impl ModbusMachine {
         })
     }
 
-    /// Reads the page with the number `page`, counted from 0, of a result. Appends its `due` data registers to `words`.
-    /// A machine may need a cycle of its program to show a page. So the request is repeated for [`ACKNOWLEDGE_TIMEOUT`]
-    /// if the machine shows another page.
+    /// Reads one page of a result and appends its data registers to `words`. A result is transferred in pages (blocks
+    /// of registers). `page` is the number of the page, counted from 0. `due` is the expected number of data registers
+    /// in this page. The machine may need some time to provide the page, so the request is repeated for
+    /// [`ACKNOWLEDGE_TIMEOUT`] if the machine provides another page.
     ///
     /// # Errors
-    /// The machine still shows another page, the page has another number of registers than `due`, or a request fails.
+    /// Returns an error if the machine still provides another page after this time, if the number of registers in the
+    /// page is not `due`, or if a request fails.
     async fn fetch_page(&mut self, page: u32, due: usize, words: &mut Vec<u16>) -> Result<(), DeviceError> {
         let map = self.unit.map;
         let mut select = self.unit.writer();
@@ -1092,7 +1100,8 @@ macro_rules! modbus_driver {
                 Self(ModbusMachine::new($kind, link, settings))
             }
 
-            /// Returns the Modbus line, for its statistics or to create another machine on it.
+            /// Returns the Modbus line of this machine. Use it to read the statistics of the line, or to create the
+            /// driver of another machine on the same line.
             pub fn link(&self) -> &Link {
                 self.0.link()
             }

@@ -169,7 +169,8 @@ pub(super) struct CommandFrame {
 }
 
 impl CommandFrame {
-    /// Returns the 20 registers of the command block in docs/modbus.md.
+    /// Returns the 20 registers of the command block (layout in docs/modbus.md) that contain this command. `order` is
+    /// the word order of each value of two registers.
     pub(super) fn words(&self, order: WordOrder) -> Vec<u16> {
         let (job, cycle, digest) = self.job.map_or((0, 0, 0), |job| (job.job, job.cycle, job.digest));
         let mut frame = Writer::new(order);
@@ -187,7 +188,7 @@ pub(super) trait Payload: Identified {
     const KIND: u16;
     /// Name in messages.
     const NAME: &'static str;
-    /// Returns the registers of the payload in a word order.
+    /// Returns the registers of the payload. `order` is the word order of each value that needs more than one register.
     fn words(&self, order: WordOrder) -> Vec<u16>;
     /// Returns the first value in the payload that no machine could accept. The result contains the name of the field,
     /// its value, and the allowed values in words. Returns `None` if all values are acceptable.
@@ -366,7 +367,8 @@ pub(super) enum RecordError {
     Unlisted { field: &'static str, found: u32 },
 }
 
-/// Returns the number of registers of a point record in this format, or `None` for an unknown format.
+/// Returns the number of registers that one measured point occupies in a result: 16 in `format` 1 (coordinates in mm),
+/// 10 in `format` 2 (coordinates in counts). Returns `None` for any other format.
 pub(super) fn point_registers(format: u16) -> Option<usize> {
     match format {
         1 => Some(16),

@@ -47,7 +47,8 @@ pub(super) struct ReadAheadFailures {
 }
 
 impl ReadAhead {
-    /// Returns the number of complete points in the stored pages.
+    /// Returns the number of measured points whose registers are complete in the pages stored so far. A page is one
+    /// block of registers of the result of a measurement.
     fn point_count(&self) -> usize {
         self.words.len() / self.header.registers
     }
@@ -56,9 +57,12 @@ impl ReadAhead {
         (self.words.len() / PAGE_REGISTERS) as u32
     }
 
-    /// Returns true if the next page should be read now: the machine has measured enough points to fill it. `progress`
-    /// is the number of measured points in the status. Returns false if the page was already read at this progress and
-    /// was not full. Also returns false if the result would exceed its maximum size.
+    /// Returns true if the next page (block of registers) of the partial result should be read now, because the machine
+    /// has measured enough points to fill this page. `progress` is the number of measured points in the last status of
+    /// the machine.
+    ///
+    /// Returns false if this page was already read when the machine reported the same `progress`, and the page was not
+    /// full then. Also returns false if the stored pages would exceed the maximum size of a result.
     fn is_due(&self, progress: u32) -> bool {
         let registers = u64::from(progress) * self.header.registers as u64;
         let end = self.words.len() + PAGE_REGISTERS;
@@ -67,12 +71,13 @@ impl ReadAhead {
 }
 
 impl ModbusMachine {
-    /// Reads preliminary points of `job` while the job still runs. Does at most one step (header or one page) after
-    /// each read of the status. Returns the new points, in the order of the plan.
+    /// Reads preliminary points of `job` while the machine still executes `job`. The machine stores its result as one
+    /// header and numbered pages (blocks of registers). Each call reads the header or at most one page. A second call
+    /// does nothing before the status of the machine was read again. Returns the new points, in the order of the plan.
     ///
     /// Returns `None` if there are no new points, a request fails, or `interrupt` is raised. Also returns `None` if
-    /// reading ahead is not possible: the machine does not offer it, the line is too slow, this client did not start
-    /// the job, or earlier requests failed too often.
+    /// preliminary points cannot be read: the job is not in progress, the machine does not support it, one page takes
+    /// too long on the line, this client did not start the job, or earlier requests for this job failed too often.
     pub(super) async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<PreliminaryPoints> {
         let block = self.last_block.take()?;
         let runs = matches!(
@@ -97,10 +102,14 @@ impl ModbusMachine {
         self.read_ahead_failures.start == start && self.read_ahead_failures.count >= MAX_FAILURES
     }
 
-    /// Records that a request to read ahead failed with `error`. `start` is the sequence number of the START that began
-    /// the job. Discards the pages that were read ahead. After [`MAX_FAILURES`] communication errors, nothing more is
-    /// read ahead for this job. After any other error, for example invalid data, reading ahead stops at once. The
-    /// answer that the machine is busy does not count and discards nothing.
+    /// Handles a failed request for a part of a result whose job still runs. `start` is the sequence number of the
+    /// START that began the job, and `error` is the error of the request.
+    ///
+    /// - If the machine answered that it is busy, does nothing.
+    /// - After any other communication error, discards the stored pages of the result and counts the failure. After
+    ///   [`MAX_FAILURES`] such errors, no more pages are read until the job has ended.
+    /// - After any other error, for example invalid data, discards the stored pages. No more pages are read until the
+    ///   job has ended.
     fn count_failure_ahead(&mut self, start: u32, error: &DeviceError) {
         if self.read_ahead_failures.start != start {
             self.read_ahead_failures = ReadAheadFailures { start, count: 0 };
@@ -148,12 +157,13 @@ impl ModbusMachine {
             && (ahead.job, ahead.start) == (job, start)
     }
 
-    /// Reads the header of the partial result of `job`, which still runs, and stores it for the pages to come. `block`
-    /// is the last status. Stores nothing if the machine has no partial result yet.
+    /// Reads the header of the partial result of `job`, which still runs. Stores this header, so that the pages of the
+    /// result can be read and decoded next. `block` is the last status of the machine. Stores nothing if the machine
+    /// has no partial result yet, or if the identity of the machine must be verified again.
     ///
     /// # Errors
-    /// The header names another job or plan, has a `done` number although the job still runs, or contains an invalid
-    /// value. Or the request fails.
+    /// The request fails. Or the header has another kind, names another job or plan, states that the job has ended, or
+    /// contains an invalid value.
     async fn begin_ahead(&mut self, job: Job, block: &StatusBlock) -> Result<(), DeviceError> {
         let address = self.unit.map.outbox_header;
         let words = self.unit.request_once("outbox header", address, LinkRequest::Read { address, count: 56 }).await?;
@@ -184,12 +194,15 @@ impl ModbusMachine {
         Ok(())
     }
 
-    /// Reads the page with the number `page`, counted from 0, of the partial result. Stores the page if the machine
-    /// shows this page and it is full. `progress` is the number of measured points in the last status. Returns the
-    /// points that the page completes. Returns `None` if there are none.
+    /// Reads the page of the partial result that the machine shows at present. `page` is the number of the requested
+    /// page, counted from 0. Stores the page if the machine shows the page with this number and this page is full.
+    /// `progress` is the number of measured points in the last status of the machine.
+    ///
+    /// Returns the points whose registers have become complete with this page. Returns `None` if there are no such
+    /// points.
     ///
     /// # Errors
-    /// The page is neither full nor empty, a point is invalid, or the request fails.
+    /// The request fails, a point is invalid, or the requested page is shown but is neither full nor empty.
     async fn read_page_ahead(&mut self, page: u32, progress: u32) -> Result<Option<PreliminaryPoints>, DeviceError> {
         let address = self.unit.map.outbox_page;
         let read = self
@@ -226,11 +239,12 @@ impl ModbusMachine {
         Ok((!told.points.is_empty()).then_some(told))
     }
 
-    /// Decodes the new points in the stored pages. `told` is the number of points that were returned before; these
-    /// points are skipped.
+    /// Decodes the points in the stored pages of `ahead` that were not returned before. `told` is the number of points
+    /// that were already returned. These points are skipped. A point whose registers are not complete yet is skipped
+    /// too.
     ///
     /// # Errors
-    /// The record of a point is invalid.
+    /// The registers of a point are invalid.
     fn points_of(&self, ahead: &ReadAhead, told: usize) -> Result<Vec<MeasuredPoint>, DeviceError> {
         let Header { format, registers, scale_mm, .. } = ahead.header;
         let new = &ahead.words[told * registers..ahead.point_count() * registers];
@@ -239,11 +253,13 @@ impl ModbusMachine {
         points.collect()
     }
 
-    /// Returns the registers of a result that were read while its job still ran. `header` is the header of the complete
-    /// result, and `done` is the sequence number of the START whose job ended.
+    /// Returns the registers of the result of `job` that were already read while this job ran. They are the first
+    /// registers of the complete result, so only the rest must still be read. `header` is the header of the complete
+    /// result, and `done` is the sequence number of the START that began the job.
     ///
-    /// Returns `None` if no registers were read ahead. Also returns `None` if they do not fit the complete result:
-    /// another job, connection, restart, plan, format or scale, or too many registers.
+    /// Returns `None` if no registers were read while the job ran. Also returns `None` if these registers do not fit
+    /// the complete result: another job, connection, restart of the machine, plan, format, kind of coordinates, probe
+    /// radius or scale, or too many registers.
     pub(super) fn registers_read_ahead(&self, job: Job, header: &Header, done: u32) -> Option<Vec<u16>> {
         let ahead = self.read_ahead.as_ref().filter(|ahead| self.belongs_to(ahead, job, done))?;
         let like = |of: &Header| {

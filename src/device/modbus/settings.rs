@@ -173,13 +173,15 @@ impl TcpWire {
         }
     }
 
-    /// Returns `None`. For a serial port this function reports that the port does not exist. For a network address this
-    /// cannot be known before a connection is tried.
+    /// Returns `None` always, because a program cannot know whether a network address exists before it tries to
+    /// connect. For a serial port, the method with the same name returns a message if the port does not exist.
     pub(super) fn missing(&self) -> Option<String> {
         None
     }
 
-    /// Reports to the document if the CMM and the grinder have the same host, port and unit.
+    /// Compares the network address of the CMM (`self`) with the address of `grinder`. Reports a problem to `document`
+    /// if host, port and unit (number of the machine on the line) are all the same. Does not report a problem if the
+    /// port is 0.
     pub(super) fn compare(&self, grinder: &Self, document: &mut Document) {
         if self == grinder && self.port != 0 {
             let found = format!("is {}, but the CMM at the same host and port has this unit number too", grinder.unit);
@@ -225,8 +227,9 @@ impl RtuWire {
     /// does that.
     pub(super) fn check_address(&self, _: &MachineTable<'_>, _: &mut Document) {}
 
-    /// Reports to the document if the CMM and the grinder have the same unit on one serial line, or different settings
-    /// of that line.
+    /// Compares the serial settings of the CMM (`self`) with the settings of `grinder`. Does nothing if the two
+    /// machines use different serial ports. Reports a problem to `document` if both machines have the same unit number
+    /// on one port, and another problem if speed, parity or stop bits differ.
     pub(super) fn compare(&self, grinder: &Self, document: &mut Document) {
         if self.device != grinder.device {
             return;
@@ -314,7 +317,8 @@ impl Default for RegisterMap {
 }
 
 impl RegisterMap {
-    /// Returns every block: its key in a cell file, its first register, and its number of registers.
+    /// Returns every block of Modbus registers: its key in a cell file, the address of its first register, and its
+    /// number of registers.
     pub fn blocks(&self) -> [(&'static str, u16, u16); 12] {
         [
             ("identity", self.identity, 32),
@@ -333,7 +337,8 @@ impl RegisterMap {
     }
 
     /// Checks the addresses of the register blocks. Reports to `document` each block that overlaps another block or
-    /// ends after register 65535. `place` gives the table of the machine for the messages.
+    /// ends after register 65535. `place` is the table of this machine in the cell file. It gives the full key for the
+    /// messages.
     pub fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         let blocks = self.blocks();
         for (k, &(name, first, count)) in blocks.iter().enumerate() {
@@ -438,12 +443,13 @@ pub struct Signal {
 }
 
 impl Signal {
-    /// Converts the signals of a cell file (`written`) and returns them. A signal without its own word order gets
-    /// `word_order`. `place` gives the table of the machine for the messages.
+    /// Converts the signals (additional values to read from a machine) of a cell file, and returns them. `written` are
+    /// the tables of the signals in the file. A signal without its own word order gets `word_order`. `place` is the
+    /// table of this machine in the file. It gives the full key for the messages.
     ///
     /// Reports to `document` each repeated name, each scale of 0, each range that is not ascending, and each address
-    /// after the last register. Such signals are returned all the same. Returns `None` if a required key of a signal is
-    /// missing; the check against the schema has reported that.
+    /// after the last register. Signals with these problems are contained in the result. Returns `None` if a required
+    /// key of a signal is missing. The check against the schema has already reported the missing key.
     pub fn from_tables(
         written: &[SignalTable],
         word_order: WordOrder,
@@ -533,7 +539,8 @@ pub struct ModbusSettings {
 }
 
 impl ModbusSettings {
-    /// Returns default settings for a machine on a line. They suit an undisturbed network; change single fields as
+    /// Returns the default settings of the driver for a machine on the Modbus line `line`. The timeouts suit a network
+    /// without disturbances. The unit number is 1, and there are no signals. Change single fields of the result as
     /// required.
     pub fn new(line: LineAddress) -> Self {
         Self {

@@ -70,7 +70,8 @@ impl ModbusUnit {
         self.identity.as_ref()
     }
 
-    /// Returns true if the machine offers full pages of a result while its job still runs.
+    /// Returns true if the machine supports reading full pages of a result (blocks of registers) while the job still
+    /// runs. Returns false if the identity of the machine is not verified.
     pub(super) fn offers_read_ahead(&self) -> bool {
         self.identity.is_some() && self.flags & OFFERS_READ_AHEAD != 0
     }
@@ -89,13 +90,21 @@ impl ModbusUnit {
         Writer::new(self.map.word_order)
     }
 
-    /// Discards the known identity, verifies the identity of the machine again and returns it.
+    /// Discards the known identity, verifies the identity of the machine again, and returns it. After a communication
+    /// error, or while the program of the machine is still starting, tries again for a limited time.
+    ///
+    /// # Errors
+    /// The machine cannot be reached, gives a wrong answer, or is not the expected machine.
     pub(super) async fn connect(&mut self) -> Result<Identity, DeviceError> {
         self.connect_within(CONNECT_BUSY_TIMEOUT).await
     }
 
-    /// Discards the known identity, verifies the identity of the machine again and returns it. Retries for the time
-    /// `busy` if the machine answers that its program is still starting.
+    /// Discards the known identity, verifies the identity of the machine again, and returns it. While the machine
+    /// answers that its program is still starting, tries again for up to the time `busy`. Also tries again after a
+    /// communication error, as every other request does.
+    ///
+    /// # Errors
+    /// The machine cannot be reached, gives a wrong answer, or is not the expected machine.
     pub(super) async fn connect_within(&mut self, busy: Duration) -> Result<Identity, DeviceError> {
         self.identity = None;
         self.verified_generation = None;
@@ -177,11 +186,15 @@ impl ModbusUnit {
         DeviceError::Corrupt { machine: self.name.clone(), data: what, expected, found }
     }
 
-    /// Returns true if a request that failed with `error` must not be sent again. `tries` is the number of retries so
-    /// far, and `began` is the time of the first request.
+    /// Decides after the error `error` whether a request is given up (true) or sent again (false). `tries` is the
+    /// number of retries so far, and `began` is the time of the first request.
     ///
-    /// Returns false only for a communication error, before `lost_after` has passed since `began`. Unless the machine
-    /// answered that it is busy, `tries` must also be below `retries`.
+    /// Gives up if one of these conditions is true:
+    ///
+    /// - The error is not a communication error.
+    /// - The setting `lost_after` (maximum time for one request with its retries) has passed since `began`.
+    /// - `tries` has reached the setting `retries` (maximum number of retries). This condition does not hold if the
+    ///   machine answered that it is busy.
     fn is_final(&self, error: &DeviceError, tries: u32, began: Instant) -> bool {
         !error.is_link() || (tries >= self.retries && !error.is_busy()) || began.elapsed() >= self.lost_after
     }
@@ -202,9 +215,13 @@ impl ModbusUnit {
         self.request_with_retries(what, address, ask, false).await
     }
 
-    /// Sends the request `ask` with at most `retries` retries. The limit also holds if the machine answers that it is
-    /// busy, so that the next read of the status is not delayed long. `what` and `address` describe the operation in
-    /// error messages. Returns the received registers.
+    /// Sends the request `ask`, and sends it again after a communication error. The setting `retries` limits the number
+    /// of retries, even if the machine answers that it is busy. So the next read of the status is not delayed long.
+    /// `what` (name of the operation) and `address` (first register) are used only in error messages. Returns the
+    /// registers of the answer.
+    ///
+    /// # Errors
+    /// Returns the error of the last try.
     pub(super) async fn request_with_limit(
         &mut self,
         what: &'static str,

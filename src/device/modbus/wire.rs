@@ -72,9 +72,11 @@ impl ModbusSettings {
     }
 }
 
-/// Returns the Modbus line of the machine with the number `unit`, and all settings of its driver. If the other machine
-/// of the cell already has a line with the same address, both machines share it; otherwise a new line is created.
-/// `missing` is a message that the serial port does not exist, or `None`.
+/// Returns the Modbus line of the machine with the number `unit`, and all settings of its driver. `line` is the address
+/// of the line. `making` contains the settings from the cell file and the line of the other machine, if this machine
+/// exists already. If both lines have the same address, both machines share one line. Otherwise a new line is created.
+///
+/// `missing` is a message that the serial port does not exist. It is `None` if no such problem was found.
 ///
 /// # Errors
 /// The serial port does not exist, or the line cannot be created.

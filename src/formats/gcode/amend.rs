@@ -199,7 +199,9 @@ fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
 }
 
 /// Returns true if the program `text` states its unit (G20 or G21) in or before the first line with a coordinate or a
-/// feed. Also returns true if no line has a coordinate or a feed, or if a line before them cannot be read.
+/// feed. Returns false if such a line comes before any unit.
+///
+/// Also returns true if the program has no such line, or if a line that cannot be read comes first.
 fn states_unit_first(text: &str) -> bool {
     for line in text.lines() {
         let Ok(block) = block(line) else { return true };
@@ -214,10 +216,13 @@ fn states_unit_first(text: &str) -> bool {
 }
 
 /// Checks that the map of `amendment` can be applied to the program `text`. `path` only names the program in messages.
+/// Comments in the program state the part and the maps that the program already contains.
 ///
 /// # Errors
-/// A program that already contains this map; a program that states another part than the map; a program whose
-/// correction is not the one that the map requires ([`MapBase`]).
+/// - The program already contains this map.
+/// - The program states another part than the map.
+/// - The map is absolute (it replaces any earlier correction), but the program already contains a correction.
+/// - The map was measured after a pass with another map, and the program does not contain that other map ([`MapBase`]).
 fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), GcodeError> {
     let refused = |what: &str, remedy| Err(GcodeError::Program { path: path.to_owned(), what: what.into(), remedy });
     let mut maps = Vec::new();

@@ -251,16 +251,16 @@ impl Control {
         Ok(())
     }
 
-    /// Processes the words of rotary axes (A, B, C), which turn the part or the tool. A rotary axis can only turn to 0,
-    /// and only before the first move at feed, because the map over x and y is valid only in this position. `asked`
-    /// holds the requests of the other words of the line.
+    /// Processes the words of rotary axes (A, B, C), which turn the part or the tool. The map over x and y is valid
+    /// only while all rotary axes are at 0. So a rotary axis can only turn to 0, and only before the first move at
+    /// feed. `block` is the line, and `asked` holds the requests of its other words.
     ///
-    /// Returns the first such word of the line, and true if a rotary axis may turn in this line. Returns `None` if the
-    /// line has no word of a rotary axis.
+    /// Returns the first word of a rotary axis in `block`, with a flag. The flag is true if an axis may turn in this
+    /// line, because no earlier line has set it to 0. Returns `None` if the line has no word of a rotary axis.
     ///
     /// # Errors
-    /// A rotary axis that would turn to another angle, turn after a move at feed, or turn in one line with a dwell, G53
-    /// or a move to the reference point.
+    /// A rotary axis that would turn to another angle, turn after a move at feed, or be given in one line with a dwell,
+    /// G53 or a move to the reference point.
     fn turning<'w>(
         &mut self,
         block: &'w Block,
@@ -282,11 +282,14 @@ impl Control {
     }
 
     /// Processes a move in machine coordinates (G53) or to the reference point (G28, G30), and returns the action. The
-    /// positions of the moved axes are then unknown. `named` holds the values of X, Y and Z in the line, and `axes` is
-    /// true if the line has at least one of them. A move to the reference point without a named axis moves all axes.
+    /// positions of the moved axes are unknown after this move. A move to the reference point without a named axis
+    /// moves all axes.
+    ///
+    /// `asked` holds the requests of the words in the line; it shows which of the two moves is meant. `named` holds the
+    /// values of X, Y and Z in the line, and `axes` is true if the line has at least one of them.
     ///
     /// # Errors
-    /// G53 without an axis, with an arc, without a motion, or in G91.
+    /// G53 without an axis, with an arc, without an active motion (G0 or G1), or in G91.
     fn machine(&mut self, asked: &BlockRequests, named: [Option<f64>; 3], axes: bool) -> Result<Act, Refusal> {
         if asked.machine && (self.relative || self.motion.is_none_or(|motion| motion > 1)) {
             return Err((

@@ -445,14 +445,20 @@ pub struct Exactness {
 
 impl Dialect {
     /// Returns the texts of this dialect for a program with the accuracy `exactness`: the lines that set the path mode,
-    /// and the words for arcs. No words for arcs are returned if `exactness` asks for straight lines only.
+    /// and the words for arcs. No words for arcs are returned if `exactness` allows only straight lines.
+    ///
+    /// The path mode selects how exactly the control follows the corners of the path. In the mode [`PathMode::Blend`],
+    /// the control rounds the corners within the path tolerance.
     ///
     /// # Errors
     /// - The dialect has no words for the path mode.
-    /// - The dialect cannot express the path tolerance, and it is not known that the control keeps this tolerance.
-    /// - The decimals of the dialect round points by more than the chord error.
-    /// - Arcs are requested that the dialect does not have, or whose tolerance is below the rounding error or above the
-    ///   chord error.
+    /// - In the mode `Blend`, the lines of the dialect do not contain the path tolerance, and the setting of the
+    ///   control is unknown or above this tolerance.
+    /// - In the mode `Blend`, the lines contain the path tolerance, but the decimals of the dialect cannot express its
+    ///   value.
+    /// - Rounding to the decimals of the dialect moves points by more than the chord error.
+    /// - Arcs are requested, but the dialect has no words for them.
+    /// - Arcs are requested with a tolerance below the rounding error or above the chord error.
     pub fn post(&self, exactness: &Exactness) -> Result<Post<'_>, DialectError> {
         let dialect = || self.dialect.name.clone();
         let (mode, word, key) = match exactness.mode {
@@ -508,12 +514,13 @@ impl Dialect {
         1e3 * 0.5 * 10f64.powi(-i32::from(self.numbers.decimals)) * 3f64.sqrt()
     }
 
-    /// Returns the lines for a head that tilts the wheel: the lines that prepare the control before the moves, and the
-    /// lines that end this state after them.
+    /// Returns the lines of this dialect for a rotary head that tilts the wheel. One group of lines comes before the
+    /// moves and selects how the control treats the tilt. The other group comes after the moves and ends this mode.
+    /// `rotary` is the rotary axis of the head.
     ///
-    /// `rotary.pivot_mm` decides which lines are needed. If it is `None`, the control itself keeps the wheel's centre
-    /// in place, and `[rotary.tool_centre]` of the dialect is returned. Otherwise the program moves the slides, and
-    /// `[rotary.slides]` is returned.
+    /// If `rotary.pivot_mm` is `None`, the control itself keeps the wheel's centre at the programmed position. Then
+    /// `[rotary.tool_centre]` of the dialect is returned. Otherwise the program states the positions of the slides (the
+    /// linear axes), and `[rotary.slides]` is returned.
     ///
     /// # Errors
     /// A dialect without the required lines.
@@ -569,8 +576,9 @@ impl Dialect {
         part.chars().map(plain).take(room).collect::<String>() + &cycle
     }
 
-    /// Returns the faults of the dialect that the JSON schema of its file cannot detect, such as a longest line that is
-    /// too short for a move.
+    /// Returns the faults of the dialect that the JSON schema of its file cannot detect. An example is a limit of the
+    /// line length (`text.longest_line`) that is too small for the block of a move. The list is empty if the dialect
+    /// has no such fault.
     pub fn faults(&self) -> Vec<DialectProblem> {
         let mut faults = Vec::new();
         let mut fault = |key: &str, found: String, allowed, remedy| {

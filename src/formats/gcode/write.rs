@@ -168,9 +168,10 @@ const MIN_LENGTH_MM: f64 = 1e-6;
 const NOTHING: i64 = i64::MAX;
 
 impl<'a> Lines<'a> {
-    /// Creates an empty text for the blocks of moves. No motion, position or feed is in force yet. `rotary` is the
-    /// rotary axis that tilts the wheel, if there is one. `count` is the number of moves that come earlier in the
-    /// program, and `numbered` the number of earlier blocks with a block number.
+    /// Creates an empty text for the blocks of moves. No motion, position or feed is active yet, so the first block
+    /// states all of them. `rotary` is the rotary axis that tilts the wheel; `None` if there is none. `count` is the
+    /// number of moves that come earlier in the program. `numbered` is the number of earlier blocks with a block
+    /// number.
     fn new(dialect: &'a Dialect, rotary: Option<&'a RotaryAxis>, count: u64, numbered: u64) -> Self {
         let power = |decimals: u8| 10f64.powi(i32::from(decimals));
         let numbers = &dialect.numbers;
@@ -359,9 +360,10 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes the two coordinates of the centre of an arc, in the order x, y, z of the axes. `centre` holds the
-    /// coordinates along the first and the second axis of `plane`, in units of the last written digit. `letters` holds
-    /// the texts before a coordinate for x, y and z. `first` is true if the block has no word yet, and becomes false.
+    /// Writes the two coordinates of the centre of an arc, in the order x, y, z of their axes. `centre` holds the
+    /// coordinates along the first and the second axis of `plane`, in units of the last written digit: 1234 is 1.234 mm
+    /// if the dialect has three decimals. `letters` holds the text that is written before a coordinate along x, y and
+    /// z, such as `I`, `J` and `K`. `first` is true if the block has no word yet. It becomes false.
     fn centre(&mut self, letters: &[String; 3], plane: Plane, centre: [i64; 2], first: &mut bool) {
         for (k, letter) in letters.iter().enumerate() {
             if let Some(at) = plane.0[..2].iter().position(|axis| *axis == k) {
@@ -370,8 +372,8 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Writes `words`, the text that begins the motion `motion`. Omits it if this motion is already in force, unless
-    /// the dialect repeats it in each block.
+    /// Writes `words`, the text that selects the kind of motion `motion`, such as `G1`. Omits this text if the same
+    /// kind of motion is already active, unless the dialect repeats the text in each block.
     #[inline]
     fn begins(&mut self, motion: Motion, words: &str) {
         if self.dialect.words.each_block || self.motion != Some(motion) {
@@ -394,9 +396,9 @@ impl<'a> Lines<'a> {
         push_decimals(&mut self.text, value, numbers.decimals);
     }
 
-    /// Writes the feed, unless the same feed is already in force. `feed` is in units of the last written digit: 6005 is
-    /// 600.5 if the dialect has one decimal for feeds. `first` is true if the block has no word yet; it becomes false
-    /// if the feed is written.
+    /// Writes the feed, unless the same feed is already active from an earlier block. `feed` is in units of the last
+    /// written digit: 6005 is 600.5 if the dialect has one decimal for feeds. `first` is true if the block has no word
+    /// yet. It becomes false if the feed is written.
     #[inline]
     fn feed(&mut self, feed: i64, first: &mut bool) {
         if feed != self.feed {

@@ -50,7 +50,8 @@ impl Kind {
         }
     }
 
-    /// Parses a number of this type (little-endian) from the bytes `at`; NaN if there are too few bytes.
+    /// Parses one number of this X3P data type (16-bit or 32-bit integer, or 32-bit or 64-bit floating-point number)
+    /// from the beginning of `at`. The bytes are in little-endian order. Returns NaN if `at` has too few bytes.
     pub(super) fn value(self, at: &[u8]) -> f64 {
         match self {
             Self::Int16 => at.first_chunk().map_or(f64::NAN, |b| i16::from_le_bytes(*b).into()),
@@ -69,10 +70,11 @@ pub(super) enum Extent {
 }
 
 impl Extent {
-    /// Returns the number of samples.
+    /// Returns the number of samples in the map: columns times rows, or the length of the list. `path` only names the
+    /// file in messages.
     ///
     /// # Errors
-    /// No samples, or more than a map can have.
+    /// The number is 0, or above the maximum for one map.
     pub(super) fn count(self, path: &Path) -> Result<usize, FormatError> {
         let [columns, rows] = match self {
             Self::Matrix(size) => size,
@@ -129,7 +131,8 @@ impl Place<'_> {
         number.ok_or_else(|| self.unexpected(node, "a finite number", &text))
     }
 
-    /// Returns the number in the child `name` of `parent`, or `default` if the child does not exist or is empty.
+    /// Returns the number in the child element `name` of the XML element `parent`. Returns `default` if this child does
+    /// not exist or is empty.
     ///
     /// # Errors
     /// A text that is not a finite number.
@@ -157,9 +160,13 @@ fn text(node: Node<'_, '_>) -> String {
 }
 
 impl Main {
-    /// Parses `main.xml`, the document that describes the map in an X3P file. `bytes` is the document and `entry` its
-    /// name in the X3P container. Returns the content of the document, and the samples. If the samples are in other
-    /// entries of the container, returns the names of these entries instead.
+    /// Parses `main.xml`, the XML document that describes the map in an X3P file. `bytes` is the content of `main.xml`.
+    /// `entry` is the name of `main.xml` in the X3P container, and `path` is the name of the X3P file; both names are
+    /// only used in messages.
+    ///
+    /// Returns two values. The first is the description of the map, such as its axes and its size. The second depends
+    /// on where the samples are stored. If they are in `main.xml` itself, the second value has the samples. If they are
+    /// in other entries of the container, the second value has the names of these entries.
     ///
     /// # Errors
     /// A document that is not valid, that describes a profile or several layers, or that has a rotated frame.
@@ -203,7 +210,9 @@ impl Main {
     }
 }
 
-/// Returns an error if the element `axes` contains a rotation matrix that is not the identity.
+/// Checks that the frame of the map is not rotated. Returns an error if the element `axes` has a rotation matrix that
+/// differs from the identity by more than 1e-9 in a number. Without a rotation matrix, the frame is accepted. `place`
+/// only names the file and the document in messages.
 fn check_frame<'d>(place: &Place<'_>, axes: Node<'d, 'd>) -> Result<(), FormatError> {
     let Some(rotation) = child(axes, "Rotation") else { return Ok(()) };
     for element in rotation.children().filter(Node::is_element) {
@@ -218,12 +227,13 @@ fn check_frame<'d>(place: &Place<'_>, axes: Node<'d, 'd>) -> Result<(), FormatEr
     Ok(())
 }
 
-/// Returns true if the first row of the data is the row with the largest y (`NW` in the element `Origin`), and adds a
-/// note on this to `notes`. Returns false if the element is `SW`, empty or missing. The standard does not have this
-/// element, but some programs write it.
+/// Returns true if the first row of the data has the largest y, so that the rows must be reversed. This is the case if
+/// the child element `Origin` of `axes` has the text `NW` (north-west). Then a message for the user is also added to
+/// `notes`. Returns false if `Origin` is `SW` (south-west), empty or missing. The standard does not have the element
+/// `Origin`, but some programs write it. `place` only names the document in messages.
 ///
 /// # Errors
-/// A value other than `SW` or `NW`.
+/// A text other than `SW` or `NW`.
 fn from_north<'d>(place: &Place<'_>, axes: Node<'d, 'd>, notes: &mut Vec<String>) -> Result<bool, FormatError> {
     let Some(origin) = child(axes, "Origin") else { return Ok(false) };
     match text(origin).as_str() {
@@ -325,9 +335,13 @@ fn samples<'d>(place: &Place<'_>, third: Node<'d, 'd>, axes: &[Axis; 3]) -> Resu
     Ok(Samples::Inline(records))
 }
 
-/// Parses the element `datum`, one sample in XML. Its text has one number for each absolute axis (an axis whose values
-/// are stored), separated by semicolons. Values of the other axes are 0. Returns `None` if the sample was not measured:
-/// its text is empty, or a number is not finite.
+/// Parses the XML element `datum`, which contains one sample. `axes` describes the axes x, y and z. The text of `datum`
+/// has one number for each absolute axis (an axis whose values are stored), separated by semicolons. Returns the three
+/// numbers x, y and z as stored; the number of an axis that is not absolute is 0. Returns `None` if the sample was not
+/// measured: the text is empty, or a number is not finite. `place` only names the document in messages.
+///
+/// # Errors
+/// A text with a wrong count of numbers, or with a word that is not a number.
 fn record<'d>(place: &Place<'_>, datum: Node<'d, 'd>, axes: &[Axis; 3]) -> Result<Record, FormatError> {
     let text = text(datum);
     if text.is_empty() {

@@ -147,9 +147,12 @@ fn linked(
     Ok(bytes.chunks_exact(width).enumerate().map(|(k, at)| if is_valid(k) { record(at) } else { None }).collect())
 }
 
-/// Converts the raw samples `records` to millimetres, with the axes and the size that `main` (the content of
-/// `main.xml`) states. Returns a height map if the samples form a matrix whose x and y follow from the column and the
-/// row. Otherwise returns points: each sample has its own position, and samples that were not measured are omitted.
+/// Converts `records`, the samples of an X3P file as stored, to millimetres. `main` is the content of `main.xml`, which
+/// has the offset and the scale of each axis and the size of the map. `path` only names the file in messages.
+///
+/// Returns a height map if the file stores a matrix of heights only. The column then gives x, and the row gives y.
+/// Otherwise the file stores x or y of each sample, or a list of samples. Then returns a list of points, and omits
+/// samples that were not measured.
 fn assembled(path: &Path, main: &Main, records: &[Record]) -> Result<X3pFile, FormatError> {
     let [x, y, z] = &main.axes;
     let mm = |axis: &Axis, raw: f64| 1e3 * (axis.offset_m + raw * axis.increment);
@@ -264,7 +267,8 @@ impl<'a> Container<'a> {
         (0..self.zip.len()).find(is_it)
     }
 
-    /// Decompresses an entry. The length that the container states for it is not trusted.
+    /// Decompresses the entry `entry` of the zip container, and returns its bytes. Stops if the entry has more than
+    /// `limit` bytes. The container also states a length for each entry, but this length can be wrong and is not used.
     ///
     /// # Errors
     /// An entry that is missing or damaged, or that has more than `limit` bytes.

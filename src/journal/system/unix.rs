@@ -96,9 +96,12 @@ pub(crate) fn is_own_file(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|found| found.is_file() && is_trusted(found.uid()))
 }
 
-/// Selects the parent folder for `folder`, the name of the lock folder. Returns the first of [`PLACES`] in which root
-/// has already created the lock folder. If there is none, returns the first of [`PLACES`] in which every user can
-/// create files, and users cannot remove files of other users. Returns `None` if there is also no such place.
+/// Selects the parent folder of the lock folder. `folder` is the name of the lock folder. The candidates are
+/// [`PLACES`], such as `/run/lock` and `/tmp`, in this order.
+///
+/// Returns the first candidate in which root has already created the lock folder. If there is none, returns the first
+/// candidate in which every user can create files but cannot remove files of other users (sticky bit). Returns `None`
+/// if no candidate has one of these two properties.
 pub(crate) fn place_of_locks(folder: &str) -> Option<PathBuf> {
     // A folder that root has created, as the package does, comes before any other.
     let by_root =
@@ -182,8 +185,8 @@ impl LockFolder {
         Ok(Self { folder, is_for_all: mode & 0o002 != 0 })
     }
 
-    /// Opens the lock file `name`. If the file does not exist, creates it with permissions that let every user of the
-    /// lock folder lock it.
+    /// Opens the lock file `name`, which several users share. If the file does not exist, creates it. All users that
+    /// can use the lock folder can then lock the file.
     ///
     /// # Errors
     /// The entry `name` cannot be used as a lock file, for example because it is a link. The error is the reason as a

@@ -83,8 +83,9 @@ pub(crate) fn free_bytes(folder: &Path) -> io::Result<u64> {
     regrind_windows::free_bytes(folder)
 }
 
-/// Returns the folder that contains the lock folder: `%ProgramData%`, where each user can create files and read those
-/// of others. Returns `None` if it does not exist.
+/// Returns the parent folder of the lock folder: the folder in the environment variable `ProgramData`. In this folder,
+/// each user can create files and read the files of other users. Returns `None` if the variable is not set or the
+/// folder does not exist.
 pub(crate) fn place_of_locks(_: &str) -> Option<PathBuf> {
     std::env::var_os("ProgramData").map(PathBuf::from).filter(|place| place.is_dir())
 }

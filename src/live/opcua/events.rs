@@ -68,11 +68,13 @@ pub(super) struct CellEvent {
     fields: Vec<(&'static str, Variant)>,
 }
 
-/// Returns the events between two published states of a cell: new cycle results, new alarms, and the end of a run.
-/// `before` is the last published status, and `now` is the new one. `on` is the last published status with an active
-/// run. Results and alarms are compared with `on` if it is of the same run, so that a run that continues after an
-/// interruption repeats no event. `own` is the index of the cell's OPC UA namespace, and `cell` is the name of the
-/// cell.
+/// Returns the events that happened between two published statuses of a cell: new cycle results, new alarms, and the
+/// end of a run. `before` is the last published status, and `now` is the new status. `own` is the index of the cell's
+/// OPC UA namespace, and `cell` is the name of the cell.
+///
+/// `on` is the last published status with an active run. It can be older than `before`, because the run can be
+/// interrupted. If `on` belongs to the same run as `now`, only results and alarms that are not in `on` are returned. A
+/// run that continues after an interruption therefore repeats no event.
 pub(super) fn events_between([before, on]: [&CellStatus; 2], now: &CellStatus, own: u16, cell: &str) -> Vec<CellEvent> {
     let from = |kind: &EventKind, severity, message: String, values: Vec<Variant>| {
         CellEvent::new((kind, own), cell, severity, &message, values)

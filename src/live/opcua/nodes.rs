@@ -330,8 +330,9 @@ fn kind_of(figure: &Figure) -> DataTypeId {
     }
 }
 
-/// Returns the OPC UA description of `unit`: `um`, `s` or `%`. The unit id is a number whose bytes are the characters
-/// of the unit's code in UNECE Recommendation 20. Any other unit gets the id 0 and no description.
+/// Returns the OPC UA description of the unit `unit`. Known units are `um`, `s` and `%`. The unit id in the description
+/// is a number: its bytes are the characters of the common code of the unit in UNECE Recommendation 20, such as `SEC`
+/// for the second. Any other unit gets the id 0 and an empty description.
 fn unit_of(unit: &str) -> EUInformation {
     let (code, name) = match unit {
         "um" => ("4H", "micrometre"),
@@ -423,10 +424,12 @@ const MACHINES: [Machine; 3] = [
     Machine { path: "BaseStateMachine/MachineState/ExecuteState", of_type: packml::EXECUTE_STATE_MACHINE_TYPE },
 ];
 
-/// Returns the values for the nodes of the three nested PackML state machines, as pairs of node path and value. For
-/// each machine these are the name, the node id and the number of its current state. `state` is the current state of
-/// the cell, `None` if it is unknown. A value is `None` if the machine is not active in `state`, or if the current
-/// state has no number. `packml` is the index of the PackML namespace.
+/// Returns the values of the `CurrentState` nodes of the three nested PackML state machines, as pairs of node path and
+/// value. `state` is the state of the cell, `None` if it is unknown. `packml` is the index of the PackML namespace.
+///
+/// Each machine has three values: the name, the node id and the number of the state that this machine is in. All three
+/// are `None` if the machine is not active while the cell is in `state`, or if `state` is `None`. Only the number is
+/// `None` for the state `Running`, which has no number.
 fn states(state: Option<StateName>, packml: u16) -> Vec<(String, Option<Variant>)> {
     let own = state.map(|state| (state.to_string(), identifier(state), Some(state_number(state))));
     let cleared = Some(("Cleared".to_owned(), packml::CLEARED, Some(CLEARED_NUMBER)));

@@ -40,8 +40,8 @@ impl BrokerOptions {
         Ok(Self { options, place: format!("{broker}:{port}") })
     }
 
-    /// Returns the options of an MQTT connection with a last will: if the connection breaks, the broker publishes
-    /// `death` under `topic`.
+    /// Returns the options of an MQTT connection with a last will (a message that the broker publishes if the
+    /// connection breaks). `death` is the content of this message, and `topic` is its topic.
     pub(super) fn with_last_will(&self, topic: &str, death: Vec<u8>) -> MqttOptions {
         let mut options = self.options.clone();
         options.set_last_will(LastWill::new(topic, death, QoS::AtLeastOnce, false));

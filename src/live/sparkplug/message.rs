@@ -33,8 +33,8 @@ pub(super) fn changes(figures: &[Figure], values: &Values, told: &Values, sequen
     (!changed.is_empty()).then(|| encoded(changed, Some(sequence)))
 }
 
-/// Encodes a death certificate (NDEATH) of the connection with this number (bdSeq). It tells hosts that the published
-/// values are no longer valid.
+/// Encodes a Sparkplug death certificate (NDEATH) as bytes. This message tells host applications that the published
+/// values are no longer valid. `connection` is the number of the connection that ends (bdSeq).
 pub(super) fn death(connection: u8) -> Vec<u8> {
     encoded(vec![number_of(connection)], None)
 }

@@ -271,8 +271,9 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Publishes a postponed message. Publishes the birth certificate (NBIRTH) if it is due. Otherwise publishes the
-    /// values that differ from the last published values. Never returns an error.
+    /// Publishes the message that was postponed because the queue of the MQTT client was full, or because a rebirth was
+    /// requested too early. If the birth certificate (NBIRTH) is not published yet, publishes it. Otherwise publishes
+    /// the values that differ from the last published values. Never returns an error.
     fn catch_up(&mut self) -> Result<(), SessionEnd> {
         self.due = None;
         match self.values {

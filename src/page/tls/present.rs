@@ -48,8 +48,8 @@ impl Tls {
         Ok(Self { acceptor: TlsAcceptor::from(Arc::new(config)), certificate: first })
     }
 
-    /// Returns true if the certificate is valid for `host`, a name or an address. A browser shows no page under a host
-    /// for which it is not valid.
+    /// Returns true if the certificate is valid for `host`, a name or an address. Returns false if `host` is neither a
+    /// name nor an address. A browser shows the page only under a host for which the certificate is valid.
     pub(crate) fn is_for(&self, host: &str) -> bool {
         let host = host.trim_start_matches('[').trim_end_matches(']');
         let (Ok(name), Ok(certificate)) = (ServerName::try_from(host), EndEntityCert::try_from(&self.certificate))

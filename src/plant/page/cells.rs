@@ -149,7 +149,9 @@ pub(super) fn tally(cells: &[CellSummary]) -> String {
     }
 }
 
-/// Draws a card for each cell.
+/// Draws a card for each cell as HTML. A card shows the name and the state of the cell, the part, and the time of the
+/// last report. If the cell still reports, the card also shows the progress of the current job and the number of
+/// alarms, if there are any.
 pub(super) fn cards(cells: &[CellSummary]) -> Markup {
     html! { div .cells { @for cell in cells { (card(cell)) } } }
 }

@@ -231,7 +231,8 @@ impl Scale {
         self.height - BOTTOM - share * (self.height - TOP - BOTTOM - 8.0)
     }
 
-    /// Returns the values of the ticks on the y axis: about four round numbers, from 0.
+    /// Returns the values, in µm, of the ticks on the y axis. The values are 0 and the multiples of a round step, up to
+    /// the maximum of the chart. The step is 1, 2 or 5 times a power of ten. There are at most five ticks.
     fn ticks(&self) -> Vec<f64> {
         let step = round_step(self.max / 4.0);
         // Rounds, so that a tick is 0.6 and not 0.6000000000000001.

@@ -110,10 +110,12 @@ async fn read(plant: &Shared, link: &DatabaseLink, asked: MapRequest) -> Result<
     })
 }
 
-/// Returns the entry of the page for the run `asked.run`, which has no error map for the requested cycle. Instead of
-/// samples, the entry contains a text that says this. The page can then show the run next to runs with a map.
+/// Returns the entry on the page for a requested error map that the plant does not have. `asked` names the run and the
+/// cycle of the map. The entry contains the data of the run, and a text with the reason instead of the samples. The
+/// page can then show this run next to runs with a map.
 ///
-/// Returns an error if the plant has no such run that made a part, or if the plant cannot be reached.
+/// Returns an error if the plant has no run with the id `asked.run` that made a part, or if the plant cannot be
+/// reached.
 async fn without(link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageError> {
     let text = "SELECT serial, cell, recipe, simulation, pv_um, rms_um FROM part_run WHERE id = $1";
     let rows = link.query(text, &[&asked.run]).await?;

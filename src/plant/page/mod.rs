@@ -140,9 +140,9 @@ async fn within<T>(making: impl Future<Output = Result<T, PageError>>) -> Result
     tokio::time::timeout(PATIENCE, making).await.unwrap_or_else(|_| Err(late()))
 }
 
-/// Returns an error page with the reason `why` the requested page cannot be shown. The status of the response depends
-/// on the reason. If the plant cannot be reached, the browser requests the page again every 5 s. `session` is the
-/// session of the person who has signed in.
+/// Returns an error page. `why` is the reason why the requested page cannot be shown. The page contains the reason, and
+/// the reason determines the HTTP status. If the plant cannot be reached, the browser requests the page again every 5
+/// s. `session` is the session of the person who has signed in.
 fn unmade(session: &Session, why: &PageError) -> Response {
     let (status, again_s, title, words) = match why {
         PageError::Plant(error) if error.may_pass() => (

@@ -219,7 +219,8 @@ async fn cycles(link: &DatabaseLink, id: i32) -> Result<Markup, PlantError> {
     })
 }
 
-/// Returns the numbers of the cycles of run `id` that have an error map.
+/// Returns the numbers of the cycles that have an error map, in ascending order. `id` is the id of the run in the
+/// plant. Returns at most 1000 numbers. Returns an error if the plant cannot be reached or refuses the query.
 async fn maps_of(link: &DatabaseLink, id: i32) -> Result<Vec<i32>, PlantError> {
     let rows = link
         .query("SELECT cycle FROM cycle_figure WHERE run_id = $1 AND map IS NOT NULL ORDER BY cycle LIMIT 1000", &[&id])

@@ -21,7 +21,8 @@ pub(super) fn encoded(text: &str) -> String {
     })
 }
 
-/// Formats a duration in seconds, rounded, in s, min, h or days, whichever suits its length.
+/// Formats a duration, given in seconds, as a rounded number with a unit. The unit is s below 90 s, min below 90 min, h
+/// below 36 h, and days otherwise. A negative duration becomes `0 s`.
 pub(super) fn ago(seconds: f64) -> String {
     match seconds {
         s if s < 90.0 => format!("{:.0} s", s.max(0.0)),
@@ -31,8 +32,9 @@ pub(super) fn ago(seconds: f64) -> String {
     }
 }
 
-/// Formats the range from `least` to `most`, both in seconds. Both numbers get the same unit (s, min or h), which
-/// depends on `most`. Returns only one number if both are equal after rounding.
+/// Formats the range of durations from `least` to `most`, both in seconds, as text, such as `5 – 8 min`. Both numbers
+/// get the same unit: s if `most` is below 90 s, min if `most` is below 90 min, otherwise h. If both numbers are equal
+/// after rounding, the text contains only one.
 pub(super) fn range([least, most]: [f64; 2]) -> String {
     let (unit, per) = match most {
         most if most < 90.0 => ("s", 1.0),
@@ -49,7 +51,8 @@ pub(super) fn um(value: Option<f64>, digits: usize) -> String {
     value.filter(|value| value.is_finite()).map_or("–".to_owned(), |value| format!("{value:.digits$}"))
 }
 
-/// Formats `of` as a percentage of `all`; a dash if `all` is 0.
+/// Formats the proportion `of` / `all` as a percentage without decimals, such as `25 %`. `of` is the count of a part of
+/// the items, and `all` is the count of all items. Returns a dash if `all` is 0 or negative.
 pub(super) fn share(of: i64, all: i64) -> String {
     if all <= 0 {
         return "–".to_owned();
@@ -66,7 +69,9 @@ pub(super) fn interval(of: i64, all: i64) -> String {
     format!("{:.0} – {:.0} %", 100.0 * low, 100.0 * high)
 }
 
-/// Computes the 95 % Wilson score interval of the proportion `of` / `all`, from 0 to 1 (E. B. Wilson, JASA 22, 1927).
+/// Returns the lower and the upper limit of the 95 % Wilson score interval of the proportion `of` / `all` (E. B.
+/// Wilson, JASA 22, 1927). `of` is the count of a part of the items, and `all`, which must be above 0, is the count of
+/// all items. Both limits are from 0 to 1.
 fn wilson(of: f64, all: f64) -> [f64; 2] {
     const Z: f64 = 1.959_964;
     let (p, z2) = (of / all, Z * Z);

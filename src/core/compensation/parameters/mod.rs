@@ -374,14 +374,15 @@ impl Columns {
         self.motions.iter().chain(&self.slides).map(|c| &c.values)
     }
 
-    /// Tests which candidate parameters are separable from motions of the part, bent guideways and the other separable
-    /// candidates.
+    /// Tests which candidate parameters can be separated from other effects. A candidate is a machine parameter that
+    /// may be estimated, with its effect on the deviation at each contact. The other effects are the motions of the
+    /// part, the bent guideways, and the other separable candidates.
     ///
-    /// Returns two lists with one entry for each candidate. The second list holds the independent share of the effect
-    /// of the candidate, from 0 to 1: the part of the effect that the others named above cannot imitate. The first list
-    /// is true if the candidate is separable: its independent share is above 0.02.
+    /// Returns two lists with one entry for each candidate. An entry of the first list is true if the candidate is
+    /// separable: its independent share is above 0.02. An entry of the second list is the independent share, from 0 to
+    /// 1: the part of the effect of the candidate that the other effects cannot imitate.
     ///
-    /// If two candidates have the same effect, only the first is separable.
+    /// If two candidates have the same effect, at most the first is separable.
     fn separability(&self) -> (Vec<bool>, Vec<f64>) {
         let mut told: Vec<bool> = Vec::new();
         for k in 0..self.candidates.len() {

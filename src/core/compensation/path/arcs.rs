@@ -333,8 +333,9 @@ impl Chord {
         Some(Self { plane, ends, middle, along: [by[a] / length, by[b] / length], half: 0.5 * length })
     }
 
-    /// Returns two coordinates of a point in the plane of the arc, in mm, with the origin in the middle of the chord:
-    /// first along the chord, then to its left.
+    /// Returns two coordinates of the point `p` in the plane of the arc, in mm. The chord is the straight line from the
+    /// start of the arc to its end, projected onto this plane. The origin is the middle of the chord. The first
+    /// coordinate is along the chord, the second is perpendicular to the chord, positive to its left.
     fn coordinates(&self, p: &Point) -> [f64; 2] {
         let [a, b, _] = self.plane.0;
         let [x, y] = [p[a] - self.middle[0], p[b] - self.middle[1]];
@@ -342,9 +343,10 @@ impl Chord {
         [x * s + y * t, y * s - x * t]
     }
 
-    /// Returns the interval `[low, high]` of the values 1 / t for which an arc through both ends of the chord passes
-    /// all samples within `within_mm`. t is the signed distance, in mm, of the centre of the arc from the chord,
-    /// positive to the left. Returns `None` if no value is suitable.
+    /// Returns the interval `[low, high]` of 1 / t, in 1/mm, for which an arc through both ends of the chord passes all
+    /// `samples` within `within_mm`. The chord is the straight line from the start of the arc to its end. t is the
+    /// distance, in mm, of the centre of the arc from the chord, positive if the centre is to the left of the chord.
+    /// Returns `None` if no value of 1 / t is suitable.
     ///
     /// Derivation: (u, v) are the [`Self::coordinates`] of a point, h is half the length of the chord, and d is the
     /// signed distance of the point from the circle with the centre (0, t) through (h, 0) and (-h, 0). Then u^2 + v^2 -
@@ -370,8 +372,9 @@ impl Chord {
         Some([low, high])
     }
 
-    /// Returns true if the coordinate perpendicular to the plane of the arc changes linearly along the chord. The
-    /// coordinate of each sample may deviate from the straight line between both ends by at most `within_mm`.
+    /// Returns true if the path between the two ends of this chord can be one arc or one helix. For this, the
+    /// coordinate perpendicular to the plane of the arc must change linearly from the first end of the chord to the
+    /// second. At each of `samples` this coordinate may deviate from the linear change by at most `within_mm`.
     fn is_level(&self, samples: &[PathPoint], within_mm: f64) -> bool {
         let c = self.plane.0[2];
         let [first, last] = [self.ends[0][c], self.ends[1][c]];
@@ -381,15 +384,18 @@ impl Chord {
         })
     }
 
-    /// Returns the arc that begins at `from`, ends at the last sample, and has its centre at the signed distance 1 /
-    /// `bend` from the chord. `bend` is in 1/mm, positive if the centre is to the left of the chord. The centre is
-    /// rounded to the last digit that a program writes. [`Arc::deviation_mm`] of the result is an upper bound of the
-    /// deviation of this arc from the path.
+    /// Returns the arc that begins at `from` and ends at the last of `samples`. The chord is the straight line from the
+    /// start of the arc to its end. `bend` gives the centre of the arc: its distance from the chord is 1 / `bend`.
+    /// `bend` is in 1/mm, positive if the centre is to the left of the chord.
+    ///
+    /// The centre is rounded to the last digit that a program writes. [`Arc::deviation_mm`] of the result is an upper
+    /// bound of the deviation of this arc from the path.
     ///
     /// Returns `None` in each of these cases:
     ///
-    /// - A coordinate of the centre, or its offset from the start, exceeds the maximum coordinate in `options`.
-    /// - The radius at the end differs too much from the radius at the start.
+    /// - A coordinate of the centre exceeds the maximum coordinate in `options`, in the model frame or relative to the
+    ///   start of the arc.
+    /// - The radius at the end differs from the radius at the start by more than `options` allow.
     /// - A sample is not between the ends of the arc.
     fn arc(&self, from: Point, samples: &[PathPoint], bend: f64, options: &ArcOptions) -> Option<Arc> {
         let [s, t] = self.along;
@@ -444,8 +450,9 @@ impl Circle {
         self.radii[1] - self.radii[0]
     }
 
-    /// Returns two deviations of a point from the arc, in mm: along the radius, and across the plane of the arc.
-    /// Returns `None` if the point is not between the ends of the arc.
+    /// Returns two signed deviations of the point `p` from the arc, in mm. The first is in the plane of the arc, along
+    /// the radius, and is positive outside the arc. The second is perpendicular to the plane. Returns `None` if the
+    /// point is not between the ends of the arc.
     fn deviation_mm(&self, p: &Point) -> Option<[f64; 2]> {
         let [a, b, c] = self.plane.0;
         let arm = [p[a] - self.centre_mm[0], p[b] - self.centre_mm[1]];
@@ -470,7 +477,8 @@ fn size([x, y]: [f64; 2]) -> f64 {
     x.hypot(y)
 }
 
-/// Rounds a coordinate to the last digit that a program writes.
+/// Rounds the coordinate `value_mm` to the last digit that a program writes, and returns the rounded value in mm. The
+/// last digit has the step 1 / `options.steps_per_mm`.
 fn written(value_mm: f64, options: &ArcOptions) -> f64 {
     (value_mm * options.steps_per_mm).round() / options.steps_per_mm
 }

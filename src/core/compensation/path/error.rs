@@ -108,9 +108,9 @@ pub enum PathError {
 }
 
 impl PathError {
-    /// Returns true if the error is a limit of the path planning in this program, not of the part or of the machine.
-    /// This is only the case for [`PathError::NotAHeight`]. A controller that plans its own path from the correction
-    /// map may then still grind the part.
+    /// Returns true only for [`PathError::NotAHeight`]: the surface is too steep or faces away from +z, so this program
+    /// cannot plan a path for it. A controller that plans its own path from the correction map may still grind the
+    /// part. Returns false for all other errors.
     pub fn is_planning_failure(&self) -> bool {
         matches!(self, Self::NotAHeight { .. })
     }

@@ -115,7 +115,8 @@ impl<'a> Moves<'a> {
         SpanWalk { span, to, t: from, step, at: self.path.wheel_position(&span, from) }
     }
 
-    /// Converts a move into the model frame. For a wheel from below, `given` is mirrored in z; otherwise the move is
+    /// Converts the move `given` into the model frame. If the wheel grinds the part from below (from -z), the path is
+    /// planned mirrored in z, so the z of the move changes its sign. If the wheel grinds from above, the move is
     /// unchanged.
     #[inline]
     fn to_model_frame(&self, given: Move) -> Move {

@@ -86,8 +86,12 @@ pub struct PathOptions {
 }
 
 impl PathOptions {
-    /// Returns the default options for a raster path with the wheel `wheel`, the distance `track_mm` between tracks and
-    /// the feed `feed_mm_min`: chord error 0.1 µm, overrun 2 mm, leads 2 mm, safe height 10 mm, no tilt.
+    /// Returns the default options for a raster path with the wheel `wheel`, the distance `track_mm` between tracks in
+    /// millimetres, and the feed `feed_mm_min` in mm/min. The default values are: chord error 0.1 µm, overrun 2 mm,
+    /// lead-in and lead-out 2 mm, safe height 10 mm, no tilt.
+    ///
+    /// The overrun is the length by which a track continues beyond the edge of the part. In the lead-in the wheel comes
+    /// down onto the surface, and in the lead-out it lifts off.
     pub fn new(wheel: Wheel, track_mm: f64, feed_mm_min: f64) -> Self {
         Self {
             wheel,
@@ -147,12 +151,16 @@ impl PathOptions {
         self.check_tilt()
     }
 
-    /// Checks if the tilt of the wheel is possible. Returns `Ok` if the options contain no tilt.
+    /// Checks if the tilt of the wheel in these options is possible. Returns `Ok` if the options contain no tilt.
     ///
     /// # Errors
-    /// Returns an error if the machine has no rotary axis, if the wheel comes from below, or if the angle is not
-    /// finite. Returns an error if the wheel is a ball, the tilt follows the normal of the surface, and the angle
-    /// between the normal and the head is below 2°. Such a ball would touch with its pole, which has no cutting speed.
+    /// Returns an error in each of these cases:
+    ///
+    /// - The machine has no rotary axis.
+    /// - The wheel grinds the part from below (from -z).
+    /// - The tilt angle is not finite.
+    /// - The wheel is a ball, the tilt follows the surface normal, and the angle between the normal and the axis of the
+    ///   head is below 2°. The ball would then touch with its pole, which has no cutting speed.
     fn check_tilt(&self) -> Result<(), PathError> {
         let Some(lean) = self.tilt else { return Ok(()) };
         if self.rotary.is_none() {

@@ -111,9 +111,16 @@ pub(super) fn relative_to_middle(outline: &Aperture, place: [f64; 2]) -> [f64; 2
     std::array::from_fn(|k| place[k] - 0.5 * (low[k] + high[k]))
 }
 
-/// Returns the groove that the wheel leaves at one place of the surface. `bend` holds contact point, normal and
-/// curvatures of the surface at this place. `[x, y]` is the place in mm, relative to the middle of the part
-/// ([`relative_to_middle`]). `pattern` gives the direction of the track: along x for a raster, tangential for a spiral.
+/// Returns the groove that the wheel leaves at one place of the surface. The result contains two values:
+///
+/// - The curvature of the groove relative to the surface, across the track, in 1/mm. The curvature is 0 if there is no
+///   groove.
+/// - The stretch: the distance between two neighbouring tracks, measured on the surface across the track, divided by
+///   their distance in the xy plane.
+///
+/// `bend` holds contact point, normal and curvatures of the surface at this place. `[x, y]` is the place in mm,
+/// relative to the middle of the part ([`relative_to_middle`]). `wheel` is the wheel with the direction of its spindle.
+/// `pattern` gives the direction of the track: along x for a raster, tangential for a spiral.
 pub(super) fn groove(bend: &SurfaceCurvature, [x, y]: [f64; 2], wheel: &Wheel, pattern: TrackPattern) -> Groove {
     // Direction of the track over x and y; the next track is at a right angle to it.
     let radius = x.hypot(y);

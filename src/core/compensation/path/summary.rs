@@ -154,7 +154,8 @@ impl ToolPath {
 }
 
 impl PathSummary {
-    /// Adds the moves of one track to the summary. `safe_z_mm` is the height at which the track begins.
+    /// Adds the moves of one track to this summary: their number, lengths and time, and their largest speed,
+    /// acceleration and jerk. `safe_z_mm` is the z, in mm, at which the first move of the track begins.
     fn add_track(&mut self, mut moves: Moves, safe_z_mm: f64) {
         let mut last: Option<Point> = None;
         let mut before: Option<ChordCurvature> = None;

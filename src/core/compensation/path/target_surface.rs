@@ -94,8 +94,12 @@ impl TargetSurface {
         (Point::new(place_mm[0], place_mm[1], s.value) + normal * d, [by_x, by_y])
     }
 
-    /// Returns the curvatures of the target surface at x and y. They come from central differences of the normals, with
-    /// a step of a thousandth of the node spacing of the nominal field.
+    /// Returns the curvatures of the target surface at the place `place_mm` (`[x, y]`, in mm). The result contains the
+    /// surface point, its normal, two orthogonal unit tangents, and the second fundamental form in these tangent
+    /// directions, in 1/mm. A curvature is positive in a hollow.
+    ///
+    /// The curvatures come from central differences of the normals, with a step of a thousandth of the node spacing of
+    /// the nominal surface.
     pub(super) fn curvature_at(&self, place_mm: [f64; 2]) -> SurfaceCurvature {
         let (point, [by_x, by_y]) = self.tangents(place_mm);
         let normal = by_x.cross(&by_y).normalize();
@@ -125,9 +129,12 @@ impl TargetSurface {
         }
     }
 
-    /// Returns the factor that corrects a step in the tangent plane when a point above a curved surface is projected
-    /// onto the surface: 1 / (1 - h k). h is `height_mm`, the height of the point above the surface. k is the mean
-    /// curvature of the surface at `place_mm`, in 1/mm, positive in a hollow. The factor is at most 1.9.
+    /// Returns the factor by which a step of the search for the projection of a point onto the surface must be
+    /// multiplied. The search projects the point onto the tangent plane. On a curved surface this gives a step that is
+    /// too short in a hollow and too long on a dome.
+    ///
+    /// Equation: 1 / (1 - h k), limited to 1.9. h is `height_mm`, the height of the point above the surface, in mm. k
+    /// is the mean curvature of the surface at `place_mm` (`[x, y]`, in mm), in 1/mm, positive in a hollow.
     fn projection_factor(&self, place_mm: [f64; 2], height_mm: f64) -> f64 {
         let [a, _, c] = self.curvature_at(place_mm).second_form_per_mm;
         (1.0 / (1.0 - 0.5 * height_mm * (a + c)).max(0.05)).min(1.9)

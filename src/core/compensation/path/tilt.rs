@@ -85,7 +85,8 @@ pub(super) struct StepDeviation {
 }
 
 impl RotaryAxis {
-    /// Returns the vector `v`, given with the head upright, after a right-handed rotation of the head by `angle_rad`.
+    /// Returns the vector `v` after a rotation of the head by `angle_rad` about the rotary axis, right-handed. `v`
+    /// turns with the head. It is given as it points when the head is upright (angle 0).
     #[inline]
     pub fn rotated(&self, v: &Vector, angle_rad: f64) -> Vector {
         let (s, c) = angle_rad.sin_cos();
@@ -95,7 +96,9 @@ impl RotaryAxis {
         }
     }
 
-    /// Converts a right-handed angle about the axis into the angle that the scale of the axis shows, in rad.
+    /// Converts the angle `angle_rad`, right-handed about the rotary axis, into the angle that the scale of the machine
+    /// shows, in rad. The sign changes if the scale counts in the opposite direction ([`RotaryAxis::reversed`]).
+    /// Otherwise the angle is unchanged.
     pub fn scale_reading_rad(&self, angle_rad: f64) -> f64 {
         if self.reversed { 0.0 - angle_rad } else { angle_rad }
     }
@@ -205,12 +208,15 @@ impl PathOptions {
         })
     }
 
-    /// Computes how far a straight step of the machine is from the curved path at the middle of the step. The step goes
-    /// from `from` to `to`; the path is at `middle` half-way.
+    /// Computes the deviation of a straight step of the machine from the curved path, at the middle of the step. The
+    /// step goes from `from` to `to`. `middle` is the position of the wheel on the path half-way between them.
     ///
-    /// During a step the controller moves the linear axes and the head in proportion. If the tilt changes, its error at
-    /// the middle is included: the angle error, multiplied by the radius of the wheel's ring, is added to the distance.
-    /// The result is in millimetres.
+    /// Returns three lengths in millimetres: the deviation of the wheel's centre, the distance that the wheel's centre
+    /// moves, and the deviation of the linear axes from the straight line between the ends of the step.
+    ///
+    /// During a step the controller moves the linear axes and the head in proportion. If the tilt follows the surface,
+    /// the tilt can be wrong at the middle. Then the angle error in rad, multiplied by the radius of the wheel's ring,
+    /// is added to the deviation of the wheel's centre. A ball has no ring, so nothing is added.
     #[inline]
     pub(super) fn step_deviation(
         &self,
@@ -245,11 +251,12 @@ impl PathOptions {
         self.tilting_axis().map_or(0.0, RotaryAxis::max_lift_mm)
     }
 
-    /// Returns the minimum height for rapid moves above a contact, in mm. This is the z of the wheel's centre at
-    /// `stand` (position and tilt of the wheel).
+    /// Returns the height, in mm, above which rapid moves must stay at one contact of the wheel. `stand` is the
+    /// position of the wheel at this contact.
     ///
-    /// If the wheel is tilted, the result is at least the z of the contact point, moved by `lifted_mm` along its
-    /// normal, plus the largest radius of the wheel.
+    /// If the wheel is upright, the height is the z of the wheel's centre in `stand`. If the path tilts the wheel, the
+    /// height is the larger of two values. One is the z of the wheel's centre. The other is the z of the contact point,
+    /// moved by `lifted_mm` along the surface normal, plus the largest radius of the wheel.
     #[inline]
     pub(super) fn clearance_height_mm(&self, contact: &Contact, lifted_mm: f64, stand: &WheelPosition) -> f64 {
         match self.tilt {

@@ -87,8 +87,9 @@ impl ToolPath {
         self.safe_z_mm
     }
 
-    /// Converts a height between the model frame and the frame of the wheel, in either direction. For a wheel from
-    /// below the sign changes; otherwise the height is unchanged.
+    /// Converts the height `z_mm` from the model frame into the frame of the wheel, or back. If the wheel grinds the
+    /// part from below (from -z), these frames are mirror images, and the sign changes. If the wheel grinds from above,
+    /// the height is unchanged.
     #[inline]
     pub(super) fn flipped_height_mm(&self, z_mm: f64) -> f64 {
         if self.options.from_below { -z_mm } else { z_mm }
@@ -114,11 +115,11 @@ impl ToolPath {
         &self.outline
     }
 
-    /// Returns position and tilt of the wheel at the point of the track `span` with the curve parameter `t`
-    /// ([`Span::place`]). In the leads before and after the track the wheel is lifted off the surface.
+    /// Returns position and tilt of the wheel at one point of the track `span`. `t` is the curve parameter of this
+    /// point: x in mm on a straight track, the angle in rad on a spiral ([`Span::place`]). In the leads before and
+    /// after the track the wheel is lifted off the surface.
     ///
-    /// All values are NaN if the rim of the wheel cannot touch at this point. [`ToolPath::new`] rejects a path with
-    /// such a point.
+    /// All values are NaN if the wheel cannot touch at this point. [`ToolPath::new`] rejects a path with such a point.
     #[inline]
     pub(super) fn wheel_position(&self, span: &Span, t: f64) -> WheelPosition {
         let contact = self.target.at(span.place(t));
@@ -133,8 +134,9 @@ impl ToolPath {
         self.options.wheel_position(&contact, lifted).unwrap_or(none)
     }
 
-    /// Returns the minimum height for rapid moves above one point of a track, in mm. The point is on `span` at the
-    /// curve parameter `t`. Returns NaN if the wheel cannot touch the surface at this point.
+    /// Returns the height, in mm, above which rapid moves must stay at one point of the track `span`. `t` is the curve
+    /// parameter of this point: x in mm on a straight track, the angle in rad on a spiral. Returns NaN if the wheel
+    /// cannot touch the surface at this point.
     fn clearance_height_mm(&self, span: &Span, t: f64) -> f64 {
         let contact = self.target.at(span.place(t));
         let lifted = self.tracks.lift_mm(span, t, &self.options);

@@ -78,9 +78,11 @@ impl Span {
         (self.arc_mm(to) - self.arc_mm(from)).abs()
     }
 
-    /// Returns the curve parameter of the point whose arc length from the point with the parameter `t` is `by_mm`, in
-    /// mm. `by_mm` is positive in the direction of increasing parameter and can be negative. On a spiral, Newton's
-    /// method solves for the parameter.
+    /// Returns the curve parameter of the point that is `by_mm` further along the track than the point with the
+    /// parameter `t`. The parameter is x in mm on a straight track, and the angle in rad on a spiral.
+    ///
+    /// `by_mm` is an arc length in mm, projected onto the xy plane. It is positive in the direction of increasing
+    /// parameter and can be negative. On a spiral, Newton's method solves for the parameter.
     fn parameter_beyond(&self, t: f64, by_mm: f64) -> f64 {
         match self.curve {
             TrackCurve::Line { .. } => t + by_mm,
@@ -99,8 +101,9 @@ impl Span {
         }
     }
 
-    /// Returns the parameters of the track at the start of the lead-in and at the end of the lead-out. In the leads the
-    /// wheel comes down onto the surface and lifts off.
+    /// Returns two curve parameters of the track: the start of the lead-in and the end of the lead-out. The parameter
+    /// is x in mm on a straight track, and the angle in rad on a spiral. In the lead-in the wheel comes down onto the
+    /// surface, and in the lead-out it lifts off.
     pub(super) fn with_leads(&self, options: &PathOptions) -> (f64, f64) {
         let ahead = (self.to - self.from).signum() * options.lead_mm;
         (self.parameter_beyond(self.from, -ahead), self.parameter_beyond(self.to, ahead))

@@ -58,8 +58,11 @@ pub enum Wheel {
 }
 
 impl Wheel {
-    /// Returns a cup wheel whose spindle is tilted from z towards -x by `tilt_rad`. `ring_mm` is the mean radius of the
-    /// ring, `tube_mm` the radius of the profile of the face.
+    /// Returns a cup wheel whose spindle is tilted from z towards -x by `tilt_rad`. A cup wheel is a ring that grinds
+    /// with its rounded face. The face lies around the spindle, in a plane perpendicular to it.
+    ///
+    /// `ring_mm` is the distance from the spindle to the middle of the face. `tube_mm` is the radius of the round
+    /// profile of the face. Both are in millimetres.
     pub fn tilted_cup(ring_mm: f64, tube_mm: f64, tilt_rad: f64) -> Self {
         Self::Cup { ring_mm, tube_mm, spindle: Vector::new(-tilt_rad.sin(), 0.0, tilt_rad.cos()) }
     }

@@ -51,8 +51,10 @@ pub(super) fn may_fit(wanted: &TargetSurface, outline: &Aperture, options: &Path
     places(outline, FEW).iter().all(|place| fit_at(&wanted.curvature_at(*place), *place, outline, options).is_ok())
 }
 
-/// Combines the results of [`fit_at`] at two places. Returns the smaller of two distances. Returns the error if only
-/// one result is an error.
+/// Combines the results of [`fit_at`] at two places. Each result is the largest allowed distance between tracks in mm
+/// (infinity if there is no limit), or the error that the wheel does not fit.
+///
+/// Returns the smaller distance if no result is an error. Returns the error if only one result is an error.
 ///
 /// If both are [`PathError::Hollow`], returns the error that requires the smaller wheel, because this wheel fits at
 /// both places. If both are errors and at least one is another error, returns `a`, so that the same path always gives
@@ -77,7 +79,8 @@ fn places(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
     places
 }
 
-/// Returns the points of a `count` x `count` grid that lie on the part, x and y in mm.
+/// Returns the points `[x, y]`, in mm, of a `count` x `count` grid that lie on the part. The grid covers the bounding
+/// box of `outline`. `count` must be at least 2.
 pub(super) fn on_grid(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
     let [low, high] = outline.bounds();
     let at = |k: usize, i: usize| low[k] + (high[k] - low[k]) * i as f64 / (count - 1) as f64;
@@ -161,16 +164,16 @@ fn hollow(bend: &SurfaceCurvature, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> 
 }
 
 /// Checks that the body of the wheel does not cut into the part away from the contact point. Contacts all over the part
-/// are tested. For each contact, all sampled surface points within the radius of the wheel are tested. A cut of up to
-/// 0.1 µm is allowed.
+/// are tested. For each contact, all sampled surface points within the largest radius of the wheel are tested. A cut of
+/// up to 0.1 µm is allowed.
 ///
 /// Another check compares the curvatures of wheel and surface, and shows only that the wheel fits near the contact.
 /// This check finds collisions of other areas: the far side of a cup, the flank of a disc, or the opposite wall of a
 /// valley.
 ///
 /// # Errors
-/// Returns [`PathError::CannotTouch`] if the wheel cannot touch the surface at one of the contacts. Otherwise returns
-/// [`PathError::Body`] for the deepest cut.
+/// Returns [`PathError::CannotTouch`] if the wheel cannot touch the surface at one of the contacts. Returns
+/// [`PathError::Body`] for the deepest cut if a cut is deeper than 0.1 µm.
 pub(super) fn check_body(wanted: &TargetSurface, outline: &Aperture, options: &PathOptions) -> Result<(), PathError> {
     let ground: Vec<([f64; 2], Point)> =
         places(outline, GROUND).into_par_iter().map(|at| (at, wanted.at(at).point)).collect();
@@ -216,7 +219,8 @@ pub(super) mod tests {
         surface(|[x, y]| (a * x * x + b * y * y, [2.0 * a * x, 2.0 * b * y]))
     }
 
-    /// Returns a surface with a given height and slopes over x and y, without a correction.
+    /// Returns a target surface without a correction, for x and y from -10 mm to 10 mm. `height` returns the height z
+    /// in mm, and the slopes along x and y, at a place `[x, y]`.
     pub(in super::super) fn surface(height: impl Fn([f64; 2]) -> (f64, [f64; 2])) -> TargetSurface {
         let on = Grid { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
         let places = (0..on.len()).map(|k| on.place_mm(k));

@@ -46,7 +46,8 @@ fn fitted(places: &[[f64; 2]], found: &[f64], session: usize) -> Observations {
 }
 
 /// Returns the share (0 to 1) of the deviations of the unseen sessions that lie within their 95 % prediction intervals.
-/// The intervals are predicted from the known sessions with `between`.
+/// The intervals are predicted from the known sessions. `between` has the hyperparameters of the prediction: those of
+/// the common field, of the noise, and of the field of a session.
 fn within(between: &BetweenSessionVariance, [known, unseen]: &[Sessions; 2]) -> f64 {
     let told = between.predict(known, unseen).unwrap();
     let hit = told.iter().zip(unseen.deviations_mm());

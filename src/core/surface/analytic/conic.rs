@@ -136,10 +136,10 @@ impl Asphere {
         Ok(Self { base, terms: sorted })
     }
 
-    /// Returns the sag z and the derivative dz/dq for q = h^2, where h is the distance from the axis. Returns `None` at
-    /// the edge of the conic and beyond.
+    /// Returns the sag z of the asphere (the conic plus the terms) and its derivative dz/dq, where `q` = h^2 and h is
+    /// the distance from the axis. Returns `None` at the edge of the conic (where its slope is infinite) and beyond.
     ///
-    /// Units: q in mm^2, the sag in mm, the derivative in 1/mm.
+    /// Units: `q` in mm^2, the sag in mm, the derivative in 1/mm.
     pub fn sag_and_derivative(&self, q: f64) -> Option<(f64, f64)> {
         let (mut sag, mut slope) = self.base.sag_and_derivative(q)?;
         let h = q.sqrt();

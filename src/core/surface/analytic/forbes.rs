@@ -54,7 +54,8 @@ impl Qcon {
         Some((sag + v * v * sum, slope + 2.0 * v * (sum + v * sum_slope) * per_mm2))
     }
 
-    /// Returns the number of terms that one evaluation sums.
+    /// Returns the number of terms that one evaluation of the sag sums, as a measure of its computing time: the base
+    /// conic counts 1, and each coefficient counts 1.
     pub(super) fn term_count(&self) -> usize {
         1 + self.coefficients_mm.len()
     }
@@ -113,7 +114,8 @@ impl Qbfs {
         Some((sag + bump / cosine, slope + (bump_slope + steeper) / cosine))
     }
 
-    /// Returns the number of terms that one evaluation sums.
+    /// Returns the number of terms that one evaluation of the sag sums, as a measure of its computing time: the
+    /// best-fit sphere counts 1, and each coefficient counts 1.
     pub(super) fn term_count(&self) -> usize {
         1 + self.p_coefficients_mm.len()
     }
@@ -155,8 +157,12 @@ fn check_coefficients(coefficients_mm: &[f64]) -> Result<&[f64], DefinitionError
     Ok(coefficients_mm)
 }
 
-/// Converts the coefficients `a` of the polynomials Qbfs_m to the coefficients of the polynomials P_m of [`p_series`],
-/// by Forbes 2010, eq. (A.13) to (A.16) and (3.8). Both lists have the same length and unit.
+/// Converts the coefficients `a` of a series in the Forbes polynomials Qbfs_m to the coefficients of the same series in
+/// the polynomials P_m, by Forbes 2010, eq. (A.13) to (A.16) and (3.8). Both lists start at m = 0 and have the same
+/// length and unit.
+///
+/// The polynomials P_m are simpler to sum. With v = (h / normalisation radius)^2 and h the distance from the axis: P_0
+/// = 2, P_1 = 6 - 8v, P_(m+1) = (2 - 4v) P_m - P_(m-1). [`p_series`] sums them.
 ///
 /// P_m = f_m Qbfs_m + g_(m-1) Qbfs_(m-1) + h_(m-2) Qbfs_(m-2), with the constants f, g and h of Forbes. So the
 /// coefficients of P are computed from the last one to the first.

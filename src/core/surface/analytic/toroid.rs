@@ -49,9 +49,15 @@ impl Toroid {
         Ok(Self { rotation_per_mm: error::checked_curvature("radius_x_mm", radius_x_mm)?, curve })
     }
 
-    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y). Returns `None` if y is at or beyond the edge of the
-    /// curve. Returns `None` if |x| is not less than the radius of the circle on which the curve point at y rotates, or
-    /// if this curve point is not on the vertex side of the axis of rotation.
+    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (`x`, `y`). The toroid arises if a curve z = g(y) is
+    /// rotated about a line that is parallel to y and meets the z axis at z = R. So the curve point at `y` moves on a
+    /// circle of the radius |R - g(y)|.
+    ///
+    /// Returns `None` in three cases:
+    ///
+    /// - `y` is at or beyond the edge of the curve.
+    /// - |`x`| is not less than the radius of the circle.
+    /// - The curve point at `y` and the vertex of the curve are not on the same side of the line.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
@@ -116,8 +122,10 @@ pub struct BiconicDefinition {
 }
 
 impl Biconic {
-    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y). Returns `None` where the root of the formula is not
-    /// real or is zero: at the edge of the surface and beyond.
+    /// Returns the sag z of the biconic and its gradient (dz/dx, dz/dy) at (`x`, `y`). Returns `None` at the edge of
+    /// the surface and beyond. There, the square root in the formula of the biconic is zero or not real: 1 - (1 + kx)
+    /// cx^2 x^2 - (1 + ky) cy^2 y^2 is not positive. Here cx and cy are the curvatures at the vertex, and kx and ky the
+    /// conic constants.
     ///
     /// Units: millimetres; the gradient has none.
     pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {

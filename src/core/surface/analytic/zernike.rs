@@ -170,8 +170,8 @@ fn noll(index: u32) -> Option<(u32, i32)> {
     Some((n, if index.is_multiple_of(2) { m as i32 } else { -(m as i32) }))
 }
 
-/// Returns the degree n and the azimuthal order m of an index in the ANSI numbering. The terms are sorted by n; within
-/// a degree m rises from -n to n in steps of 2.
+/// Returns the degree n and the azimuthal order m of the term number `index` in the ANSI numbering, which starts at 0.
+/// Never returns `None`. The terms are sorted by n. Within a degree, m rises from -n to n in steps of 2.
 fn ansi(index: u32) -> Option<(u32, i32)> {
     let (n, place) = triangular(index);
     Some((n, 2 * place as i32 - n as i32))

@@ -80,7 +80,7 @@ impl LinuxcncGrinder {
 
     /// Finds the program of a job that the driver restored before it had a connection. Stores the program in the job,
     /// so that the driver recognises this program when the controller runs it. Does nothing if there is no job or if
-    /// its program is known. An error becomes a note.
+    /// its program is known. If the search fails, adds the error as a note for the operator.
     pub(super) async fn find_restored_program(&mut self) {
         let Some(work) = self.job.as_ref().filter(|work| work.program.is_none()) else { return };
         let intended = Armed { job: work.job, start_sequence: work.sequence, token: work.token, boot_id: 0 };

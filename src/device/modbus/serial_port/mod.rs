@@ -16,7 +16,11 @@ use unix::is_there;
 #[cfg(windows)]
 use windows::is_there;
 
-/// Opens a serial port. While it is open, no other program can open it.
+/// Opens the serial port `device` with 8 data bits. `baud` is the speed in bit/s, and `stop_bits` is 1 or 2. While the
+/// port is open, no other program can open it.
+///
+/// # Errors
+/// The operating system cannot open the port, for example because it does not exist or is in use.
 pub(super) fn open(device: &str, baud: u32, parity: Parity, stop_bits: u8) -> io::Result<SerialStream> {
     let parity = match parity {
         Parity::None => tokio_serial::Parity::None,
