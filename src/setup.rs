@@ -47,7 +47,7 @@ pub enum SetupError {
     #[error("{path}: {source}")]
     Pattern { path: PathBuf, source: PatternError },
     #[error(
-        "{}: {key} is {found}, but the cell file {} allows {allowed} (limit: {limit}); change the recipe or use another cell",
+        "{}: {key} is {found}, but the cell file {} allows {allowed} (limit in that file: {limit}); change the recipe or use another cell",
         .recipe.display(), .cell.display()
     )]
     Limit { recipe: Box<Path>, cell: Box<Path>, key: &'static str, found: f64, allowed: Box<str>, limit: &'static str },

@@ -98,7 +98,7 @@ catalogue! {
     NotIdle {
         "A machine is not idle", "The run does not begin. Nothing was changed on the machine.", Operator,
         ["Check the machine. End or clear the job at the panel of the machine.",
-         "If the machine still has the job of an interrupted run, resume that run.", "Start the run again."]
+         "If the machine still has the job of an interrupted run, do not start a new run: continue the interrupted run with `regrind resume RUN`.", "Start the run again."]
     }
     /// Lost link.
     LinkLost {
@@ -110,8 +110,8 @@ catalogue! {
     }
     /// Fault of this program.
     ProgramFailed {
-        "A part of the Regrind program has failed and can no longer reach a machine", "The machine receives no heartbeat from Regrind and holds after its own time limit without a heartbeat. The run cannot continue with this machine.", ProcessEngineer,
-        ["Check the machine. End the job at the panel of the machine.", "Abort the run. The abort reaches only the machine that Regrind can still reach.",
+        "A part of the Regrind program has failed and can no longer reach a machine", "Regrind no longer sends its sign of life (heartbeat) to this machine. When the time limit of the machine for the heartbeat is over, the machine holds by itself. The run cannot continue with this machine.", ProcessEngineer,
+        ["Check the machine. End the job at the panel of the machine.", "Abort the run. The order ABORT reaches only the other machine.",
          "Report this fault of the Regrind program. Add the run folder to the report.", "Start a new run that begins with a measurement of the part as it is."]
     }
     /// Missing supplies, or a signal out of range.
@@ -153,7 +153,7 @@ catalogue! {
     }
     /// No progress.
     ProgressStands {
-        "A job makes no progress", "The machine answers and reports a running job. If the job still makes no progress, the cell holds the machine.", Nobody,
+        "A job makes no progress", "The machine answers and reports a running job. If the job still makes no progress after the time in this alarm, the cell holds the machine.", Nobody,
         ["Check the machine. Does the machine wait for a person at its panel, or does the wheel run without contact to the part?", "If in doubt, hold the run."]
     }
     /// Request refused by a machine.
@@ -177,21 +177,21 @@ catalogue! {
     PassRecord {
         "The pass record of the grinder is implausible", "The cell is held after the pass. The pass is not repeated: the part is measured as it is.",
         ProcessEngineer,
-        ["Check the part and the wheel. Was the pass ground, and with the map of this cycle and the wheel in the recipe?",
-         "Compare the value in this alarm and its limit with the program of the machine and with the recipe.", "Resume to measure the part as it is, or stop the run."]
+        ["Check the part and the wheel. Was the pass ground? Did the grinder use the map of this cycle and the wheel in the recipe?",
+         "Compare the value and the limit in this alarm with the program of the machine and with the recipe.", "Resume to measure the part as it is, or stop the run."]
     }
     /// START command with an unknown result: the machine may have started.
     StartUnknown {
         "It is unknown whether a job was started", "The cell does not send the START order again, and orders no motion.", Operator,
         ["Check the machine: is it at rest and clear of the part? Was the part touched?",
-         "Resume to ask the machine again.", "If the machine cannot answer, confirm that the job is over, and write what you saw in TEXT: `regrind confirm over --machine NAME --evidence TEXT`. Then resume to measure the part as it is.",
+         "Resume to ask the machine again.", "If the machine cannot answer, make sure that the job is over. Then run this command, with the machine in place of NAME and your observation in place of TEXT: `regrind confirm over --machine NAME --evidence TEXT`. Then resume to measure the part as it is.",
          "Or stop the run."]
     }
     /// Job that the machine no longer shows.
     JobVanished {
         "A machine no longer reports its job", "The cell does not start the job again and orders no motion.", Operator,
         ["Check the machine: is it at rest and clear of the part? Was the part touched?", "Resume to ask the machine again.",
-         "If the machine cannot answer, confirm that the job is over, and write what you saw in TEXT: `regrind confirm over --machine NAME --evidence TEXT`. Then resume to measure the part as it is.",
+         "If the machine cannot answer, make sure that the job is over. Then run this command, with the machine in place of NAME and your observation in place of TEXT: `regrind confirm over --machine NAME --evidence TEXT`. Then resume to measure the part as it is.",
          "Or stop the run."]
     }
     /// Failure that recurs.
@@ -204,13 +204,13 @@ catalogue! {
     MachineRestarted {
         "A machine was restarted during the run", "The machine may no longer know its job. The cell orders no motion.", Operator,
         ["Check the machine and the part.", "Resume to ask the machine for the state of the job.",
-         "If the machine cannot answer, confirm that the job is over, and write what you saw in TEXT: `regrind confirm over --machine NAME --evidence TEXT`. Then resume to measure the part."]
+         "If the machine cannot answer, make sure that the job is over. Then run this command, with the machine in place of NAME and your observation in place of TEXT: `regrind confirm over --machine NAME --evidence TEXT`. Then resume to measure the part."]
     }
     /// Restart of the program during the run.
     ProgramRestarted {
         "The Regrind program was restarted during the run", "The cell is held. The cell asks both machines for the state of their jobs, and holds a machine that moves.",
         Operator,
-        ["Check both machines. The state of the cell names a machine that has not confirmed that it is at rest.", "Resume: the cell continues from this state."]
+        ["Check both machines. If a machine has not confirmed that it is at rest, `regrind status` names this machine.", "Resume: the cell continues the run from the states that the machines report."]
     }
     /// Interlock: machine not clear of the part.
     NotClear {
@@ -220,7 +220,7 @@ catalogue! {
     /// Gate: too little of the part measured.
     Coverage {
         "Too little of the part was measured", "This measurement is not used.", Operator,
-        ["Check the part for coolant, swarf or a clamp, and the stylus for wear or bending.", "Resume to measure again."]
+        ["Check whether coolant, swarf or a clamp covers the part. Check whether the stylus is worn or bent.", "Resume to measure again."]
     }
     /// Gate: no part found.
     NoPart {
@@ -239,7 +239,7 @@ catalogue! {
     PartMoved {
         "The part has moved since the first touches of this measurement",
         "The repeated touches are not used: the probe made these touches after the part had moved.", Operator,
-        ["Check that the part is clamped and was not moved.", "Wait until the temperature of part and room is stable.",
+        ["Find out why the part has moved, for example because a clamp was loose or a person pushed the part. Then clamp the part.", "Wait until the temperature of part and room is stable.",
          "Resume to measure the whole part again."]
     }
     /// Gate: wrong radius of the probe.
@@ -282,7 +282,7 @@ catalogue! {
     }
     /// Directions of the pose that the surface determines weakly.
     WeakDirections {
-        "The surface determines the position of the part too weakly to place a correction",
+        "The shape of the surface does not determine the position of the part well enough for a correction",
         "No correction is computed. The error map of this cycle is in the run folder.", ProcessEngineer,
         ["Lock the directions that this alarm names (recipe key registration.lock), if the fixture or the reference points define these directions well enough.",
          "Or measure features that determine these directions: edges, reference marks or a wider aperture.", "Start a new run that begins with a measurement."]
@@ -303,7 +303,7 @@ catalogue! {
     /// Response of the part with the wrong sign.
     SignFlipped {
         "The part responded to the map with the opposite sign", "Another pass would make the part worse. The cell is held.", ProcessEngineer,
-        ["Check the sign of the map at the grinder: a positive value leaves material.", "Do not resume before a test pass on a scrap part has shown the right sign.",
+        ["Check the sign of the map at the grinder: at a positive value, the grinder must leave more material on the part.", "Do not resume before a test pass on a scrap part has shown the right sign.",
          "Stop the run."]
     }
     /// Response to a mirrored or turned map.
@@ -320,9 +320,9 @@ catalogue! {
     }
     /// No response to the map.
     NoEffect {
-        "The part did not respond to the map", "Another pass would change nothing. The cell is held.", ProcessEngineer,
+        "The part did not respond to the map", "Until the cause is removed, another pass changes nothing. The cell is held.", ProcessEngineer,
         ["Check whether the wheel reached the part and whether the grinder used the map.", "Check wheel radius and work offset.",
-         "Resume for another pass, or stop the run."]
+         "If the cause is removed, resume for another pass. Otherwise, stop the run."]
     }
     /// Part that gets worse.
     Diverging {
@@ -340,12 +340,12 @@ catalogue! {
     Undecided {
         "The measurement does not prove whether the part is good or bad", "The run holds or stops, as the recipe defines.", ProcessEngineer,
         ["Measure with more points or less noise: a smaller uncertainty can show whether the part is good or bad.",
-         "Another pass would remove material and is not expected to help."]
+         "Another pass would remove material, but would probably not improve the part."]
     }
     /// Part that is in tolerance only without the outliers.
     LeftOut {
         "The part exceeds a limit because of outliers, which are points that deviate from all their neighbours",
-        "The part is not accepted: each outlier is judged as a point of the part until the probe has touched its place again.", Operator,
+        "The part is not accepted: an outlier counts as a real point of the part until the probe has touched the place of the outlier again.", Operator,
         ["Check the places that this alarm names. Clean these places and the probe without moving the part.",
          "Resume to touch these places and a few places around each of them again. If these places cannot be touched alone, the whole part is measured.",
          "If the same places are named again, the defects are on the part: stop the run, and let the quality department decide about the part."]
@@ -353,7 +353,7 @@ catalogue! {
     /// Passes used up.
     MaxCycles {
         "The recipe allows no further pass", "The run ends. The part is not in tolerance.", ProcessEngineer,
-        ["Check the figures of the cycles.", "If the figures still fall from cycle to cycle, allow more passes in the recipe (max_cycles), and start a run that begins with a measurement."]
+        ["Check the figures of the cycles.", "If PV and RMS still decrease from cycle to cycle, allow more passes in the recipe (max_cycles), and start a run that begins with a measurement."]
     }
     /// Removal budget used up.
     BudgetSpent {
@@ -375,7 +375,7 @@ catalogue! {
         "The channel for orders to the cell is lost", "The run continues, and Regrind opens the channel again. Until then, use the terminal of the run: press Ctrl-C once to hold the run, twice to abort the run.",
         ProcessEngineer,
         ["Find the person or program that deletes or moves files of the run folder.", "Check with `regrind status` whether orders reach the cell again.",
-         "If orders do not reach the cell, hold the run."]
+         "If orders still do not reach the cell, hold the run: press Ctrl-C once at the terminal of the run."]
     }
     /// Hold that was not confirmed.
     HoldNotConfirmed {

@@ -499,10 +499,12 @@ impl RecordedParameter {
         let Self { name, unit, off, expanded, taken, told, removes_rms_um } = self;
         let found = format!("{name}: error {off:.2} \u{b1} {expanded:.2} {unit}");
         if *taken == 0.0 && *told == 0.0 {
-            return format!("{found}; this error is not significant, so only the map corrects the part");
+            return format!(
+                "{found}; this error is not significant, so this parameter is not corrected; the map corrects the whole error"
+            );
         }
         format!(
-            "{found}; {taken:.2} {unit} of this error is compensated (total correction {told:.2}); the RMS decreases by {removes_rms_um:.2} \u{b5}m"
+            "{found}; the next pass compensates {taken:.2} {unit} of this error (total correction of the parameter, in the same unit: {told:.2}); this lowers the RMS by {removes_rms_um:.2} \u{b5}m"
         )
     }
 }

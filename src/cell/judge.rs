@@ -219,7 +219,7 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
         return tell(
             Verdict::MaxCycles,
             format!(
-                "not proven in tolerance after {passes} of {} allowed passes: {figures}{response}",
+                "the part is not proven in tolerance after {passes} of {} allowed passes: {figures}{response}",
                 plan.max_cycles
             ),
         );
@@ -235,10 +235,13 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
         }
         if has_stalled(plan, before, now) {
             let least = match plan.stall_mm {
-                0.0 => format!("the larger of the measuring uncertainty and {:.0} %", 100.0 * plan.stall_share),
+                0.0 => format!(
+                    "the larger of two limits (measuring uncertainty; {:.0} % of the previous value)",
+                    100.0 * plan.stall_share
+                ),
                 least => {
                     format!(
-                        "the largest of the measuring uncertainty, {:.0} % and {}",
+                        "the largest of three limits (measuring uncertainty; {:.0} % of the previous value; {})",
                         100.0 * plan.stall_share,
                         format_um(least)
                     )
@@ -282,7 +285,7 @@ fn judge_next_pass(
     let Some(forecast) = forecast else { return tell(Verdict::Continue, format!("{so_far}: {figures}")) };
     let (expected, sigma) = (format_um(forecast.rms_mm), format_um(forecast.sigma_mm));
     let floor = forecast.floor_mm.map_or(String::new(), |floor| format!(", lower bound {}", format_um(floor)));
-    let expected = format!("expected after another pass: RMS {expected} ± {sigma}{floor}");
+    let expected = format!("expected after another pass: RMS {expected} ± {sigma} (standard deviation){floor}");
     let [_, rms] = plan.tolerance.compare(now);
     // If the found rms exceeds the floor by no more than its uncertainty, another pass cannot improve it.
     let at_floor = forecast.floor_mm.is_some_and(|floor| rms.median_mm <= floor + rms.expanded_mm);

@@ -489,7 +489,9 @@ impl Cell {
                 let least = 100.0 * self.plan.gates.least_found;
                 Some((
                     AlarmId::Coverage,
-                    format!("{found} of {targets} points were found, required are {least:.0} % to 100 %"),
+                    format!(
+                        "the probe found {found} of {targets} planned points, allowed are {least:.0} % to 100 % of the planned points"
+                    ),
                 ))
             }
             GateResult::Passed => None,
@@ -796,7 +798,9 @@ impl Cell {
         if let Some((_, JobStep::Run)) = phase.job()
             && let Some(device) = Device::BOTH.into_iter().find(|device| self.machine(*device).manual)
         {
-            return Err(format!("the {device} is in manual mode; turn its key to automatic, then resume"));
+            return Err(format!(
+                "the {device} is in manual mode; turn the mode key of this machine to automatic, then resume"
+            ));
         }
         let absent: Vec<_> = Device::BOTH.into_iter().filter(|device| !self.machine(*device).ready).collect();
         if !absent.is_empty() && self.cycle == 0 {
@@ -814,7 +818,7 @@ impl Cell {
                     None => "is not connected",
                 };
                 return Err(format!(
-                    "the {device} {what}; the cell connects to this machine again; after the connection, resume once more"
+                    "the {device} {what}; the cell now connects to this machine again; when this machine is connected, resume again"
                 ));
             }
         }
@@ -1039,7 +1043,11 @@ impl Cell {
             Held(_) | Suspended(_) if at_job => {}
             // It had no job, moved, and was ordered to hold.
             _ if !at_job && self.active_alarms.contains_key(&AlarmId::MovesUnasked) => {}
-            state => return Err(format!("the {device} reports a hold, but has no job to hold in the state {state}")),
+            state => {
+                return Err(format!(
+                    "the {device} reports a hold, but this machine has no job to hold while the cell is in the state {state}"
+                ));
+            }
         }
         Ok(())
     }
@@ -1057,7 +1065,9 @@ impl Cell {
             Suspended(_) if at_run => self.suspend(run),
             Execute(_) | Holding(_) | Suspending(_) if at_run => {}
             state => {
-                return Err(format!("the {device} reports a resume, but has no job to resume in the state {state}"));
+                return Err(format!(
+                    "the {device} reports a resume, but this machine has no job to resume while the cell is in the state {state}"
+                ));
             }
         }
         Ok(())
@@ -1142,7 +1152,10 @@ impl Cell {
     /// If the part was accepted already, raises an alarm and ends the run instead.
     pub(super) fn on_restarted(&mut self, actor: &str) {
         if self.state == Completing {
-            self.raise(AlarmId::NotClear, "the program ended before both machines were confirmed clear of the part");
+            self.raise(
+                AlarmId::NotClear,
+                "the program ended before the confirmation that both machines are clear of the part",
+            );
             return self.finish_complete();
         }
         for known in &mut self.machines {
@@ -1295,7 +1308,7 @@ impl Cell {
             }
             Aborting => self.on_abort_deadline(),
             Completing => {
-                self.raise(AlarmId::NotClear, "at least one machine was not confirmed clear of the part in time");
+                self.raise(AlarmId::NotClear, "no confirmation in time that both machines are clear of the part");
                 self.finish_complete();
             }
             Idle | Stopped | Aborted | Complete => {}
@@ -1352,7 +1365,7 @@ impl Cell {
     fn on_abort_deadline(&mut self) {
         let unconfirmed = self.unconfirmed_aborts();
         if unconfirmed.is_empty() {
-            self.raise(AlarmId::NotClear, "at least one machine was not confirmed clear of the part in time");
+            self.raise(AlarmId::NotClear, "no confirmation in time that both machines are clear of the part");
             return self.finish_aborted(true);
         }
         if self.abort_repeated {

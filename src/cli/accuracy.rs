@@ -28,7 +28,7 @@ of the whole surface is extrapolated from the errors of the two coarser surfaces
 Example:
   regrind accuracy --nominal lens.csv --want 1
 
-Exit codes: 0 the curved distance is accurate enough; 1 the curved distance is not accurate enough;
+Exit codes: 0 the error PV in the line `curved` is at most --want, or --want is not given; 1 this error exceeds --want;
 2 bad arguments or data; 3 fault.")]
 pub(super) struct Arguments {
     /// Nominal surface: points as text or PLY, a mesh as STL or PLY, or a TOML definition, in mm

@@ -45,10 +45,10 @@ enum AuditCommand {
 RUN is the folder of a run; by default the newest under runs/. If RUN is a folder of runs, the command verifies
 each run, and names missing, renamed and exchanged runs: each run has a number and refers to the run before.
 
-Some changes are detected only with a copy that was kept elsewhere:
-- the newest runs are missing: with an anchor of these runs, or with the copies at a plant;
-- the end of a record was cut off together with its anchor: with --anchor and a copy of journal.anchor;
-- a record was rewritten from its beginning: with the same copy, or with --key and a copy of the public key.
+The command detects some changes only with a copy from another place:
+- The newest runs are missing. Needed: a copy of the anchor of these runs, or the records in the database of a plant.
+- The end of a record was cut off, and the anchor was changed to fit. Needed: --anchor with a copy of journal.anchor.
+- A record was rewritten from its beginning. Needed: --anchor with this copy, or --key with a copy of the public key.
 
 Without --key, the signatures are checked against the key in the record itself. docs/journal.md shows how to verify a
 record without this program.
@@ -233,13 +233,13 @@ pub(super) fn is_whole(verified: &Verified, keys: &[PublicKey]) -> Result<bool, 
     match verified {
         // With a key, an end that this key has not signed is not trusted, even if a process holds the lock.
         verified if verified.lacks_last_seal() && (!verified.under_way || !keys.is_empty()) => Err(
-            "the end of the record is not signed, although the run has a key: somebody without the key can have written the records after the last signature",
+            "the end of the record is not signed, although the run has a key: the records after the last signature may come from a person without the key",
         ),
         Verified { anchored: 0, .. } => {
             Err("journal.anchor is missing: it is unknown whether the end of the record was cut off")
         }
         Verified { closed: false, under_way: false, .. } => Err(
-            "the run was interrupted: its program no longer runs, and the record has no end; later events are unknown",
+            "the run was interrupted: its program no longer runs, and the record stops before the end of the run; later events are unknown",
         ),
         verified => Ok(verified.closed && !verified.lacks_last_seal()),
     }
@@ -260,7 +260,7 @@ fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     let edited = unrecorded.iter().any(|name| report(&name))
         && std::fs::read_to_string(folder.join(RUN_REPORT)).ok() != run_report(folder).ok();
     let report = if edited {
-        "report      report.html differs from the report that the record gives: the file or the program changed\n"
+        "report      report.html differs from the report that Regrind now makes from the record: a person changed the file, or the version of Regrind changed\n"
     } else {
         ""
     };
@@ -319,7 +319,7 @@ fn sound(folder: &Path, begin: &Value, verified: &Verified, as_given: bool) -> S
         }
         (false, anchored) => {
             format!(
-                "the run is not closed: no record up to record {anchored} was cut off; if later records were cut off, this is not detected"
+                "the run is not closed: nothing was cut off up to record {anchored}; if later records were cut off, this is not detected"
             )
         }
     };

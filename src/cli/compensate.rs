@@ -85,9 +85,9 @@ The new program contains the hashes of the old program and of the map. The comma
 - a program that is already corrected by this map;
 - a map of another part;
 - an error map that was measured after a pass with a correction other than the one in the program;
-- a correction.csv for a program that already has a correction: a correction.csv is the total, not an addition.
-The new program does not go deeper as a whole. If the map raises the tool, the tool cuts air. To prevent this, set the
-zero of the tool lower.
+- a correction.csv for a program that already has a correction: this file has the total correction.
+The command does not lower the whole program. At points where the map raises the tool, the tool may not reach the part.
+To prevent this, set the zero of the tool lower.
 
 Exit codes: 0 written; 2 bad arguments or data; 3 fault.";
 

@@ -21,8 +21,8 @@ use super::words::time_left;
 pub(super) fn help(example: &str) -> String {
     format!(
         "\
-RUN is the folder of a run; by default the active run under runs/. The record gets your user name in the operating
-system.
+RUN is the folder of a run; by default the active run under runs/. Regrind writes your user name in the operating
+system into the record.
 
 Example:
   {example}

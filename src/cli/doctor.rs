@@ -26,11 +26,11 @@ use super::{Outcome, check, control, key};
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The command checks each machine by its kind:
-- Modbus: reads the identity and the status, and writes only the heartbeat of a client;
+- Modbus: reads the identity and the status, and writes only the heartbeat (sign of life) of this program;
 - server of I++ DME: opens a session, reads the identity and the status, and ends the session;
 - LinuxCNC: reads the identity and the status without taking control;
-- machine that prints its hits: listens for 5 s;
-- machine that exchanges files, or that a person serves: reads nothing from the machine.
+- measuring machine that only sends a line of text for each hit (touch): waits 5 s for a line;
+- machine that exchanges files, or that a person operates: checks only the folders and settings.
 
 Example:
   regrind doctor config/modbus-tcp.toml --recipe recipes/freeform-mirror.toml
@@ -125,7 +125,7 @@ fn folder(runs: &Path) -> Finding {
         Err(error) => Finding::new("folder of the runs", FindingLevel::Obstacle, error.to_string()),
         Ok(()) if free < LITTLE_BYTES => {
             let words = format!(
-                "the disk of {} has {} MB free, but a run of many points requires hundreds of MB; free space on the disk",
+                "the disk of {} has {} MB free, but a run with many points can require hundreds of MB; delete or move files to get more free space",
                 runs.display(),
                 free >> 20
             );
@@ -145,8 +145,8 @@ fn folder(runs: &Path) -> Finding {
 fn open_runs(runs: &Path) -> Option<Finding> {
     let open = control::folders(runs).filter(|folder| is_open_to_all(folder)).count();
     let words = format!(
-        "every user of this computer can read {open} of the runs, and can block an active run; to prevent this: \
-         `chmod o-rwx {}/*`",
+        "the folders of {open} run(s) are open to every user of this computer. A user who reads the record of an \
+         active run can block this run. Restrict the access: `chmod o-rwx {}/*`",
         runs.display()
     );
     (open > 0).then(|| Finding::new("runs", FindingLevel::Notice, words))
@@ -166,8 +166,8 @@ fn clock(runs: &Path) -> Finding {
     let last = last.unwrap_or_default();
     if now.as_str() < MIN || now < last {
         let words = format!(
-            "the clock shows {now:.19}, but the last record was written at {last:.19}: set the clock; the order of the \
-             records stays correct in any case"
+            "the clock of this computer shows {now:.19}. This time is before the last record ({last:.19}) or before \
+             the release of this program. Set the clock. The order of the records is correct also with a wrong clock"
         );
         return Finding::new("clock", FindingLevel::Notice, words);
     }
@@ -184,7 +184,7 @@ fn signing() -> Finding {
         Ok(None) => Finding::new(
             "audit key",
             FindingLevel::Notice,
-            "there is no key, so records are not signed; to make one: regrind audit key",
+            "this user has no signing key, so records are not signed; to create a key: regrind audit key",
         ),
         Err(error) => Finding::new("audit key", FindingLevel::Obstacle, error.to_string()),
     }
@@ -205,7 +205,7 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
         return vec![Finding::new(
             "machines",
             FindingLevel::Good,
-            "simulated within the program: there is nothing to connect",
+            "simulated within the program, so there is no connection to check",
         )];
     }
     let settings = |link| setup::modbus_settings(link, cell.simulated, 1, 1);
@@ -285,8 +285,9 @@ async fn heard(link: &LinkConfig, made: Result<impl Machine, DriverError>) -> Fi
         None => {
             let listened = LISTENS.as_secs();
             let words = format!(
-                "{name} is open, but no line arrived in {listened} s: start this command again and touch something within this \
-                 time; then the command shows the formats that match the line"
+                "the connection to {name} is open, but no line of text arrived in {listened} s. Start this command \
+                 again, and touch something with the probe within this time. Then the command shows the formats that \
+                 match the line"
             );
             Finding::new(what, FindingLevel::Notice, words)
         }

@@ -62,7 +62,7 @@ pub(super) enum Failure {
     #[error(transparent)]
     Setup(SetupError),
     #[error(
-        "the run cannot start from the learned error of {run}: {source}; or start without the learned error: write learn = false in the recipe"
+        "the run cannot start with the correction of the error that run {run} learned: {source}. Another remedy: write learn = false in the recipe, to start without this correction"
     )]
     TooMuchLearned { run: String, source: NextPassError },
     #[error("{path}: {reason}")]
@@ -70,7 +70,7 @@ pub(super) enum Failure {
     /// The record was read. It was changed, or its author is not proven.
     #[error(transparent)]
     Broken(JournalError),
-    #[error("{}: the runs have {flaws} flaw(s); the first flaw: {first}", .runs.display())]
+    #[error("{}: the check of the runs in this folder found {flaws} flaw(s); the first flaw: {first}", .runs.display())]
     RunsLack { runs: PathBuf, flaws: usize, first: String },
     #[error(
         "{}: the cell file requires a signed record (cell.require_signature), and this user has no key; make one \
@@ -97,19 +97,19 @@ pub(super) enum Failure {
     Machine(JournalError),
     #[error("{path}: no control socket can be created there: {source}; give --runs a local folder with a shorter name")]
     ControlSocket { path: PathBuf, source: io::Error },
-    #[error("{path}: there is no run; name the folder of a run")]
+    #[error("{path}: this path contains no run; name the folder of a run")]
     NoRun { path: PathBuf },
     #[error("{path}: this run is not active ({source}); to see how the run ended: `regrind audit show`")]
     NotRunning { path: PathBuf, source: io::Error },
     #[error(
-        "{path}: it is unknown whether this run is active: this user has no permission ({source}); give the command as \
-         the user who started the run"
+        "{path}: it is unknown whether this run is active, because this user has no permission to connect to the run \
+         ({source}). Give the command as the user who started the run"
     )]
     MayNotAsk { path: PathBuf, source: io::Error },
     #[error(
-        "{path}: the program of the cell does not answer, and will not execute this request later. Its process is \
-         stopped (SIGSTOP, a debugger), or the computer is overloaded. A machine that receives nothing from this \
-         program holds by itself: check both machines"
+        "{path}: the program that runs the cell did not answer in time. The program will not execute this request, \
+         also if the program continues later. The program is stopped (SIGSTOP, a debugger), or the computer is \
+         overloaded. A machine that receives nothing from the program holds by itself: check both machines"
     )]
     NoAnswer { path: PathBuf },
     #[error("{} runs are active: name one of {}", .runs.len(), .runs.iter().map(|run| run.display().to_string()).collect::<Vec<_>>().join(", "))]
@@ -117,8 +117,8 @@ pub(super) enum Failure {
     #[error("{}: the run is over and cannot continue; to see how it ended: `regrind report`", .run.display())]
     Over { run: PathBuf },
     #[error(
-        "{path}: the disk has {} MB free, and the first cycle may require {} MB; free space, or name another folder \
-         with --runs",
+        "{path}: the disk has {} MB free, but the first cycle can require {} MB; delete or move files, or name a \
+         folder on another disk with --runs",
         .free >> 20, .needed.div_ceil(1 << 20)
     )]
     NoSpace { path: PathBuf, free: u64, needed: u64 },
@@ -129,7 +129,7 @@ pub(super) enum Failure {
     #[error(
         "{address} is open to other computers; give the page a certificate (--certificate FILE --key FILE) and users \
          (--users FILE). Or show the page at 127.0.0.1, and connect from another computer through a tunnel: \
-         ssh -L 7373:127.0.0.1:7373 CELL"
+         ssh -L 7373:127.0.0.1:7373 CELL (CELL is the name of this computer)"
     )]
     ForOthers { address: SocketAddr },
     #[error(transparent)]
@@ -183,7 +183,9 @@ pub(super) enum Failure {
         .run.display()
     )]
     OtherTask { run: PathBuf, what: &'static str },
-    #[error("the port of the {device} is not available: {source}")]
+    #[error(
+        "the connection to the {device} cannot be opened: {source}; check the cable, and the address in the cell file"
+    )]
     Port { device: regrind::cell::Device, source: io::Error },
     #[error("{device}: {source}")]
     Recover { device: regrind::cell::Device, source: regrind::drive::recovery::RecoveryError },
@@ -197,20 +199,22 @@ pub(super) enum Failure {
     Replay(regrind::drive::ReplayError),
     #[error("the cell did not accept the order: {message}")]
     OrderRefused { message: String },
-    #[error("`confirm over` requires --machine and --evidence: the machine that you checked, and your finding")]
+    #[error(
+        "the command `confirm over` requires two options: --machine with the machine that you checked, and --evidence with your finding"
+    )]
     Evidence,
     #[error(
         "--map is too short: give at least the first 8 digits of the hash of the map that the grinder uses; the hash is in correction.json"
     )]
     ShortMap,
-    #[error("`confirm clear` requires --machine: the machine that you checked")]
+    #[error("the command `confirm clear` requires the option --machine with the machine that you checked")]
     NoMachine,
     #[error("{path} already exists; choose another folder, or move the existing one away")]
     IsThere { path: PathBuf },
     #[error("the model of the error cannot be computed: {0}")]
     NoModel(regrind::model::ModelError),
     #[error(
-        "the folder to create is missing; name the folder, for example: regrind init mirrors --machines modbus-tcp"
+        "the name of the new folder is missing; give a name, for example: regrind init mirrors --machines modbus-tcp"
     )]
     NoFolder,
     #[error("{path}: {source}; give the folder of the runs with --runs")]
@@ -228,7 +232,7 @@ pub(super) enum Failure {
     NotSaved(FormatError),
     #[error("signals of the operating system cannot be received: {0}")]
     Signals(io::Error),
-    #[error("the terminal cannot be written to: {0}")]
+    #[error("the terminal cannot be used: {0}")]
     Terminal(io::Error),
 }
 

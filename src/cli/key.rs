@@ -73,7 +73,8 @@ fn in_words(public: &PublicKey, path: &Path, made: bool) -> String {
         "public key   {public}\nfingerprint  {fingerprint}\nfile         {}, {made}\n\n\
          Runs of this user sign their records with this key from now on. Keep the public key where nobody at this computer can change it:\n\
          give it to the quality department, which verifies records with `regrind audit verify --key`. Keep the key file on this\n\
-         computer, and in no copy that others can read. If the key file is lost, no record is lost, but later runs need another key.\n",
+         computer. Other persons must not be able to read the file or a copy of the file.\n\
+         If the key file is lost, no record is lost, but later runs need another key.\n",
         path.display()
     )
 }

@@ -117,7 +117,7 @@ async fn go(run: RunInputs, machines: Machines, actor: Actor) -> Result<Ending, 
         && let Err(error) = drive.listen_also_at(door)
     {
         eprintln!(
-            "{}: orders cannot be received at this socket: {error}",
+            "{}: this control socket cannot be opened: {error}; the cell receives orders only through the socket in the folder of the run",
             regrind::document::visible(&door.display().to_string())
         );
     }

@@ -134,7 +134,7 @@ impl ArcsDocument {
     fn in_words(&self, points: u64) -> String {
         let n = three_digits;
         format!(
-            "{} and {} replace {}; {} moves per second instead of {}; distance from the path {} µm, limit {} µm; largest corner between moves {} mrad instead of {}",
+            "{} and {} replace {}; {} moves per second instead of {}; largest distance from the path {} µm, limit {} µm; largest change of direction between two moves {} mrad instead of {}",
             counted(self.arcs as usize, "arc"),
             counted(self.lines as usize, "line"),
             counted(points as usize, "line"),
@@ -177,7 +177,7 @@ impl TiltDocument {
     fn in_words(&self) -> String {
         let n = three_digits;
         format!(
-            "tilt        {} from {} to {}°, at most {}°/min; the angle between the normals of the part and the upright head is at least {}°\n",
+            "tilt        rotary axis {} from {} to {}°, at most {}°/min; smallest angle between the upright head and a normal of the part: {}°\n",
             self.axis,
             n(self.least_deg),
             n(self.most_deg),
@@ -230,7 +230,7 @@ impl ScallopsDocument {
             .filter_map(|(what, um)| um.map(|um| format!("{what} {} µm", n(um))))
             .collect();
         format!(
-            "PV {} µm and RMS {} µm between tracks {} mm apart; {} allowed for all errors together",
+            "PV {} µm and RMS {} µm, with {} mm from track to track; {} allowed for form error and scallops together",
             n(self.pv_um),
             n(self.rms_um),
             n(track_mm),
@@ -371,7 +371,7 @@ fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
     let beyond = ScallopsDocument::new(&scallops, recipe).beyond();
     (!beyond.is_empty()).then(|| {
         format!(
-            "the scallops between the tracks use {}, limit {} %; no correction can remove scallops; write grinding.track_mm = {} or less, or \
+            "the scallops between the tracks are too high: {}, limit {} %; no correction can remove scallops; write grinding.track_mm = {} or less, or \
              use a wheel with a larger radius across the tracks",
             beyond.join(" and "),
             100.0 * MAX_SCALLOP_SHARE,
@@ -443,7 +443,7 @@ fn words(d: &Document) -> String {
     let warnings: String = d.warnings.iter().map(|warning| format!("warning     {warning}\n")).collect();
     format!(
         "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nscallops    {}\nprogram     {program}\n{arcs}{tilt}{learns}\
-         level       {} µm over the nominal surface in the first pass, at least {} µm deeper in each further pass, {} µm in the last\nbudget      {} µm of material in all passes\nremoval     {}\ncycles      at most {}\ntime        {}\n{warnings}",
+         level       {} µm over the nominal surface in the first pass, at least {} µm deeper in each further pass, {} µm in the last (negative: below the surface)\nbudget      {} µm of material in all passes\nremoval     {}\ncycles      at most {}\ntime        {}\n{warnings}",
         d.part,
         counted(d.nominal_points, "point"),
         d.part_identity,

@@ -104,7 +104,9 @@ async fn wait_for_lock(config: &PlantConfig, arguments: &Arguments) -> Result<Pu
             return Ok(turn);
         }
         if !std::mem::replace(&mut waits, true) && !arguments.while_stdin {
-            eprintln!("tell: another program publishes this cell already; this program waits until the other one ends");
+            eprintln!(
+                "tell: another program already publishes the values of this cell; this program waits until the other program ends"
+            );
         }
         tokio::time::sleep(ROUND).await;
     }

@@ -120,12 +120,12 @@ impl Recovery {
         let Some(settings) = settings else {
             let words = match (link.wire.ippdme_address(), link.wire.linuxcncrsh_address()) {
                 (Some(_), _) => {
-                    "the server of this machine stores no job, so no job must be ended; check that the probe is clear of the part"
+                    "the server of this machine stores no job, so there is no job to end; check that the probe is clear of the part"
                 }
                 (_, Some(_)) => {
-                    "its controller stores no job; if a program runs or is paused, end this program at the machine"
+                    "the controller of this machine stores no job; if a program runs or is paused, end this program at the machine"
                 }
-                _ => "this machine reports nothing over a wire; bring the machine to idle by hand",
+                _ => "this machine has no data connection; bring the machine to idle by hand",
             };
             super::print(&format!("{device}: {words}\n"))?;
             return Ok(false);

@@ -231,7 +231,7 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
         line(
             "",
             format!(
-                "other pose: {} from the pose found, RMS {} µm over a sample of the points",
+                "another pose also fits: {} away from the pose above, RMS {} µm for a sample of the points",
                 apart(document, other),
                 um(other.rms_mm)
             ),
@@ -255,14 +255,14 @@ fn form_in_words(form: &Form) -> String {
     };
     let lay = hyperparameters.field.anisotropy.angle_rad().map_or(String::new(), |angle_rad| {
         let (times, degrees) = (three_digits(hyperparameters.field.anisotropy.stretch), angle_rad.to_degrees().round());
-        format!(", {times} times as long at {degrees}° from x as across this direction")
+        format!(", where the range in the direction {degrees}° from x is {times} times the range across this direction")
     });
     let sigma = [0, 1, 2].map(|k| um(frame_covariance[(k, k)].sqrt())).join(", ");
     let areas = area_in_words(form);
     let few = match form.is_underdetermined {
         true => format!(
-            "warning     {} degrees of freedom are too few to separate the form from the noise; at least 20 are required. The upper limits count the whole \
-             deviation as form, and they include form that the pose can have absorbed. Measure more points\n",
+            "warning     {} degrees of freedom are too few to separate the form from the noise; at least 20 are required. The upper limits therefore \
+             count the whole deviation as form. They also include form that the fit of the pose can have removed from the deviations. Measure more points\n",
             form.degrees_of_freedom
         ),
         false => String::new(),

@@ -24,8 +24,8 @@ const LINGERS: Duration = Duration::from_secs(30);
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The command runs until you stop it. While the plant cannot be reached, the command keeps trying. The plant verifies the
-chain of every record on arrival. If a journal was cut or rewritten after its replication, this is reported here and at
-the plant. The cell never waits for this command.
+chain of every record on arrival. If a journal was shortened or changed after its replication, this command and the
+plant report the change. The cell never waits for this command.
 
 Examples:
   regrind ship --plant plant.toml

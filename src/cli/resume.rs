@@ -27,15 +27,16 @@ use super::{Outcome, check, control, key};
 /// Resume a held cell, or a run whose program has ended
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; by default the run under runs/ that is running now, otherwise the newest without an end in
-its record.
+RUN is the folder of a run; by default the active run under runs/. If no run is active, the default is the newest run
+without an end in its record.
 
 A run whose program has ended without an end in its record (a crash, a power failure) is resumed in this terminal. The
-record is verified and replayed without any command, the machines are asked for the state of their jobs, and the cell
-goes to Held, \"The Regrind program was restarted during the run\". Then inspect the machines, and give the same command in
-another terminal: the run continues. If the folder shows that records were lost (the log of the database or journal.anchor is
-missing or damaged), the run resumes only with --despite-loss, which confirms that you have inspected both machines.
-Otherwise bring the machines to idle with `regrind recover`.
+program verifies the record, and replays the record without commands to the machines. The program then reads the state
+of the jobs from the machines, and the cell goes to Held, \"The Regrind program was restarted during the run\". Then
+inspect the machines, and give the same command in another terminal: the run continues. If the folder shows that
+records were lost (the log of the database or journal.anchor is missing or damaged), the run resumes only with
+--despite-loss, which confirms that you have inspected both machines. Otherwise bring the machines to idle with
+`regrind recover`.
 
 Examples:
   regrind resume

@@ -28,8 +28,9 @@ pub(super) const LEARNED_FROM: &str = "learned_from.json";
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Without --cell everything is simulated, on real Modbus TCP connections within this program, and marked SIMULATION.
-Ctrl-C once holds the cell at the next safe place; twice aborts it. A closed terminal (SIGHUP) and a stopped service
-(SIGTERM) stop the run: the machines go to their safe place, and the run ends. A second signal aborts the run.
+Press Ctrl-C once to hold the cell at the next safe place, or twice to abort the run. A closed terminal (SIGHUP) and a
+stopped service (SIGTERM) stop the run: the machines go to their safe place, and the run ends. A second signal aborts
+the run.
 
 Example:
   regrind run recipes/freeform-mirror.toml
@@ -244,7 +245,10 @@ impl EarlierKnowledge {
             match task.start_from_learned(learned.clone()) {
                 Ok(()) => self.learned = Some((learned, text)),
                 Err(source) => {
-                    self.messages.push(format!("the knowledge from {} cannot be used: {source}", learned.run));
+                    self.messages.push(format!(
+                        "the learned results of {} cannot be used, so the run begins without these results: {source}",
+                        learned.run
+                    ));
                 }
             }
         }
@@ -297,7 +301,7 @@ fn others_in_words(others: &KnowledgeOrigin) -> String {
     let [least, most] = [percent(f64::min), percent(f64::max)];
     match others.differ.is_empty() {
         false => format!(
-            "begins with the knowledge from {runs}: assumed difference between the machines {least:.0} to {most:.0} %, from {} comparison(s) of machines\n",
+            "begins with the knowledge from {runs}: assumed difference between the repeatable errors of the machines: {least:.0} to {most:.0} % (RMS), based on {} comparison(s) of machines\n",
             others.comparisons
         ),
         true => format!(

@@ -183,7 +183,7 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
     let PlantRecipe { name, version, .. } = &recipe;
     let due = lease.due.as_ref().map_or(String::new(), |due| format!(", due {due}"));
     let told = format!(
-        "{}  by version {version} of the recipe {name}, signed by {}{due}\n",
+        "{}  to be made by version {version} of the recipe {name}, signed by {}{due}\n",
         lease.serial,
         signed.join(" and ")
     );

@@ -14,7 +14,8 @@ use super::failure::Failure;
 /// List the runs with their part, progress and result
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Active runs are first, then the newest. The list is not verified; see `regrind audit verify`.
+Active runs are first, then the newest. This command does not verify the records; to verify a record:
+`regrind audit verify`.
 
 Example:
   regrind runs --part SN-0042

@@ -29,7 +29,7 @@ const LINGERS: Duration = Duration::from_secs(3);
 The page shows the active run and can give orders to this run, in the same way as `regrind hold`. Open the page on this
 computer with the printed address, which contains a key. For other computers, the page needs users that sign in and a
 certificate. The certificate has the names by which these computers reach the page. Alternatively, use a tunnel:
-ssh -L 7373:127.0.0.1:7373 CELL
+ssh -L 7373:127.0.0.1:7373 CELL (CELL is the name of this computer)
 
 Examples:
   regrind serve --runs runs

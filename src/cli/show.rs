@@ -139,7 +139,7 @@ impl Show {
                     self.line(&format!("cycle {cycle}: {}", told.in_words()))?;
                 }
                 if let Some(mm) = summary.map_rms_mm {
-                    self.line(&format!("cycle {cycle}: error that remains for the correction map: {} µm RMS", three_digits(1e3 * mm)))?;
+                    self.line(&format!("cycle {cycle}: error that the correction map must correct: {} µm RMS", three_digits(1e3 * mm)))?;
                 }
                 summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
             }

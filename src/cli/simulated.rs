@@ -111,7 +111,7 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
         let path = grinder.executed_path(folder).map(|command| executed(command, &world, recipe));
         let path = path.transpose().map_err(&failed)?;
         let Wire::Ippdme(wire) = &mut cell.cmm.link.wire else {
-            return Err(failed("with LinuxCNC, only a measuring machine with I++ DME can be simulated".into()));
+            return Err(failed("a simulated cell with LinuxCNC requires a measuring machine with I++ DME; change cmm.wire in the cell file, or do not simulate".into()));
         };
         simulated.serve_dme(wire, world.touch_probe(), speed, probe_radius_mm, path).await.map_err(&failed)?;
         return Ok(simulated);
@@ -121,7 +121,7 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
         link.wire.modbus_line().ok_or_else(|| failed(none.into()))
     };
     if recipe.grinding.tilt.is_some() && cell.grinder.program.folder.is_none() {
-        let why = "grinding.tilt tilts the wheel, but without programs the simulated grinder keeps the wheel upright; write grinder.program.folder into the cell file";
+        let why = "the recipe has a tilted wheel (grinding.tilt), but the simulated grinder tilts the wheel only in grinding programs; write grinder.program.folder into the cell file";
         return Err(failed(why.into()));
     }
     let grinder = match by_programs(cell).map_err(&failed)? {
@@ -195,7 +195,7 @@ fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
     let name = &program.dialect.dialect.name;
     let control = Control::named(name).ok_or_else(|| {
         format!(
-            "no simulated control reads the dialect `{name}`; remove grinder.program.folder from the simulated cell"
+            "the simulated grinder cannot read grinding programs in the dialect `{name}`; remove grinder.program.folder from the simulated cell"
         )
     })?;
     let head = cell.grinder.rotary.map(|axis| Head {
@@ -265,7 +265,7 @@ impl SimulatedCell {
         let server = dme::Server::new(machine, speed, dme::faults::CommandFaults::none());
         let (host, port) = (wire.host.clone(), wire.port);
         let serving = ServingDme::tcp_after((host.as_str(), port), server, grinder).await.map_err(|e| {
-            format!("{host}:{port} cannot be served: {e}; choose another port, or end the program that uses this port")
+            format!("the simulated machine cannot use the address {host}:{port}: {e}; choose another port, or end the program that uses this port")
         })?;
         wire.port = serving.local_addr().port();
         self.places.push(format!("I++ DME {host}:{}", wire.port));
@@ -297,7 +297,7 @@ impl SimulatedCell {
         let mut serving = match wire.source() {
             HitSource::Tcp { host, port } => {
                 let serving = ServingHits::tcp((host.as_str(), port)).await.map_err(|e| {
-                    format!("{host}:{port} cannot be served: {e}; choose another port, or end the program that uses this port")
+                    format!("the simulated machine cannot use the address {host}:{port}: {e}; choose another port, or end the program that uses this port")
                 })?;
                 wire.port = serving.local_addr().map_or(port, |address| address.port());
                 self.places.push(format!("hit lines {host}:{}", wire.port));
@@ -345,7 +345,7 @@ impl SimulatedCell {
         match line {
             LineAddress::Tcp { host, port } => {
                 let serving = Serving::tcp((host.as_str(), *port), units).await.map_err(|e| {
-                    format!("{host}:{port} cannot be served: {e}; choose another port, or end the program that uses this port")
+                    format!("the simulated machine cannot use the address {host}:{port}: {e}; choose another port, or end the program that uses this port")
                 })?;
                 let bound = serving.local_addr().map_or(*port, |address| address.port());
                 self.places.push(format!("Modbus TCP {host}:{bound}, {}", names.join(" and ")));

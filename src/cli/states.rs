@@ -15,7 +15,8 @@ use super::failure::Failure;
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The table is computed from every event in every reachable state. A line has an event, the next state, and the commands of
-the cell. More than one answer means that the response depends on the values of the event or on earlier events.
+the cell. If an event has several lines, the next state or the commands depend on the values of the event or on earlier
+events.
 
 Examples:
   regrind states --state Held

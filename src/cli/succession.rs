@@ -252,10 +252,10 @@ impl Proof {
         let last_name = name_of(last);
         if last_name != *run {
             self.flaws.push(format!(
-                "{last_name}: by its number this run comes before {name}, but {name} names {run} as the run before it"
+                "{last_name}: by number, this run comes before {name}, but {name} names another predecessor: {run}"
             ));
         } else if hash_of(last, *records).as_deref() != Some(head) {
-            let what = format!("the hash of record {records} has changed since {name} began");
+            let what = format!("record {records} does not have the hash that {name} stores");
             self.flaws
                 .push(format!("{run}: this run differs from the run that {name} names as its predecessor: {what}"));
         }

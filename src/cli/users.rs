@@ -82,7 +82,7 @@ fn add(name: &str, role: PageRole, path: &Path) -> Result<(), Failure> {
     };
     users.add(name, role, &password(name)?)?;
     write_private(path, users.to_text().as_bytes())?;
-    super::print(&format!("{} may sign in as {role}; list in {}\n", name.trim(), path.display()))
+    super::print(&format!("{} can now sign in as {role}; user list: {}\n", name.trim(), path.display()))
 }
 
 fn remove(name: &str, path: &Path) -> Result<(), Failure> {

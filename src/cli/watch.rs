@@ -31,7 +31,8 @@ const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
 #[derive(Args, Debug)]
 #[command(after_help = "\
 RUN is the folder of a run; by default the run under runs/ that is running now. Keys: h holds the cell, u shows the
-uncertainty of the map, q quits and leaves the cell as it is. If the output is not a terminal, each new state is a line.
+uncertainty of the map, q quits and leaves the cell as it is. If the output is not a terminal,
+regrind prints one line for each new state.
 
 Example:
   regrind watch

@@ -135,7 +135,7 @@ impl MachineTables<'_> {
         if !wire.has_registers() {
             let idle = [("registers", self.registers.is_some()), ("signals", !self.signals.is_empty())];
             for (table, _) in idle.iter().filter(|(_, there)| *there) {
-                let found = "is set for a wire that has no registers";
+                let found = "is set, but the connection of this machine (`wire`) has no registers";
                 document.report(&self.key(table), found, "it would have no effect", "remove it, or change the wire");
             }
         }
@@ -150,12 +150,12 @@ impl MachineTables<'_> {
             document.report(
                 &self.key("timing.lost_after_ms"),
                 format!(
-                    "is {} ms, but {} tries of {} ms take {all_tries_ms} ms",
+                    "is {} ms, but all {} tries of a request, {} ms each, take {all_tries_ms} ms",
                     written.lost_after_ms,
                     u64::from(written.retries) + 1,
                     written.request_timeout_ms
                 ),
-                "it must cover every try",
+                "the time must be long enough for all tries",
                 "raise `lost_after_ms`, or lower `request_timeout_ms` or `retries`",
             );
         }
@@ -163,7 +163,7 @@ impl MachineTables<'_> {
             if 2 * ms > written.lost_after_ms {
                 document.report(
                     &self.key(&format!("timing.{name}")),
-                    format!("is {ms} ms, more than half of `lost_after_ms`, {} ms", written.lost_after_ms),
+                    format!("is {ms} ms, which is more than half of `lost_after_ms` ({} ms)", written.lost_after_ms),
                     "one late poll or heartbeat must not count as a lost machine",
                     "lower it, or raise `lost_after_ms`",
                 );
@@ -202,8 +202,8 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
             document.report("grinder.program.dialect", found, "LinuxCNC reads only its own dialect", "remove it");
         }
         if written.folder.is_some() {
-            let found = "is set for a wire that transfers the program";
-            document.report("grinder.program.folder", found, "the wire has its own folder", "remove it");
+            let found = "is set, but the LinuxCNC driver transfers the program itself";
+            document.report("grinder.program.folder", found, "the folder is grinder.wire.programs", "remove it");
         }
     }
     let dialect = match dialect::read_named_dialect(&written.dialect, path) {
@@ -214,7 +214,7 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
             let found =
                 format!("is {:?}: {}", written.dialect, problems.to_string().lines().next().unwrap_or_default());
             let remedy = format!(
-                "write one of these names, or correct the dialect file; to check the file: regrind check {}",
+                "write the name of a known dialect, or correct the dialect file; to check the file: regrind check {}",
                 file.display()
             );
             let allowed = format!("it must be one of {known}, or a valid dialect file");
@@ -226,7 +226,7 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
     match arcs_within_mm.map(|mm| dialect.arcs(mm)) {
         Some(Err(DialectError::NoArcs { dialect })) => document.report(
             "grinder.program.arcs_within_um",
-            format!("is set for the dialect `{dialect}`, which has no words for arcs"),
+            format!("is set, but the dialect `{dialect}` has no commands for arcs"),
             "arcs require [arcs] in the dialect",
             "remove this key, or add the table [arcs] to a dialect file of your own",
         ),
@@ -234,7 +234,7 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
             "grinder.program.arcs_within_um",
             format!("is {found_um} µm"),
             &format!(
-                "rounding to the {decimals} decimals of the dialect `{dialect}` moves points by up to {least_um:.4} µm"
+                "it must be at least {least_um:.4} µm, the rounding error of the {decimals} decimals of `{dialect}`"
             ),
             "raise arcs_within_um; or, if the control reads more decimals, write a dialect of your own with more \
              decimals",
@@ -286,7 +286,7 @@ fn travel(written: &TravelTable, machine: &str, document: &mut Document) -> Opti
     let (least_mm, most_mm) = (written.min_mm?, written.max_mm?);
     for (k, axis) in ["x", "y", "z"].into_iter().enumerate() {
         if least_mm[k] >= most_mm[k] {
-            let found = format!("is {} mm in {axis}, and `max_mm` is {} mm", least_mm[k], most_mm[k]);
+            let found = format!("is {} mm in {axis}, but `max_mm` is only {} mm", least_mm[k], most_mm[k]);
             document.report(
                 &format!("{machine}.travel.min_mm"),
                 found,
@@ -326,7 +326,7 @@ fn limits(grinder: &GrinderTable, document: &mut Document) -> Option<GrinderLimi
     if wheel_radius_mm[0] > wheel_radius_mm[1] {
         document.report(
             "grinder.limits.min_wheel_radius_mm",
-            format!("is {} mm, more than `max_wheel_radius_mm`, {} mm", wheel_radius_mm[0], wheel_radius_mm[1]),
+            format!("is {} mm, but `max_wheel_radius_mm` is only {} mm", wheel_radius_mm[0], wheel_radius_mm[1]),
             "no wheel can fit",
             "check whether the two are swapped",
         );

@@ -146,14 +146,14 @@ impl fmt::Display for NextStep {
                 let name = device.to_string().to_lowercase();
                 return write!(
                     f,
-                    "check whether the {device} is at rest; then: regrind resume (the cell asks the machine for the \
-                     state of its job). If the machine cannot answer, confirm that the job is over: regrind confirm \
+                    "check that the {device} is at rest; then: regrind resume. The cell asks the machine for the state \
+                     of its job. If the machine cannot answer, declare the job ended with the command: regrind confirm \
                      over --machine {name} --evidence \"what you saw\""
                 );
             }
             Self::KeepAway => "keep away from both machines: they run their safe sequence",
             Self::EmergencyCircuit => {
-                "use the emergency circuit of each machine that has not confirmed that it is at rest"
+                "use the emergency circuit of each machine that has not yet confirmed its standstill"
             }
             Self::ReadReport => "the run is over: read its report.html",
         })

@@ -236,7 +236,9 @@ async fn serve_client(caller: Client, desk: ControlService) -> io::Result<()> {
             ),
         },
         Ok(line) if line.has_misleading_text() => refusal(
-            "not an order: it contains characters that are invisible or change the reading direction".into(),
+            "not an order: the text contains characters that are invisible or change the reading direction; remove \
+             these characters"
+                .into(),
             &status,
         ),
         Ok(RequestLine { request, by }) => forward_request(request, on_behalf(peer, by), &orders, &status).await,
@@ -268,7 +270,8 @@ async fn forward_request(
     match tokio::time::timeout(ANSWER_TIMEOUT, handed_over).await {
         Ok(reply) => reply.unwrap_or_else(over),
         Err(_) => refusal(
-            "the cell did not answer in time; it is unknown whether it accepted the order; check with `regrind status`"
+            "the cell did not answer in time; it is unknown whether the cell accepted the order; check with `regrind \
+             status`"
                 .into(),
             status,
         ),

@@ -163,8 +163,8 @@ pub trait DriverFactory {
 pub enum DriverError {
     /// A required folder does not exist.
     #[error(
-        "{key}: the folder {path} does not exist; create this folder where the {machine} can use it (mkdir -p {path}), \
-         or correct the cell file"
+        "{key}: the folder {path} does not exist; create this folder (mkdir -p {path}) and give the {machine} access \
+         to this folder, or correct the cell file"
     )]
     Folder { key: String, path: PathBuf, machine: MachineKind },
     /// The file of reference points is not valid.
@@ -175,8 +175,8 @@ pub enum DriverError {
     NoPort { missing: String },
     /// The positions of the machine must be checked against its volume, but the cell file gives no volume.
     #[error(
-        "cmm.travel is missing: Regrind checks every position against this box before {machine} moves; add \
-         [cmm.travel], the box that the centre of the probe must not leave"
+        "cmm.travel is missing: Regrind must check every position against the travel limits before {machine} moves; \
+         add [cmm.travel] with the minimum and the maximum x, y and z of the probe centre"
     )]
     NoVolume { machine: String },
     /// This wire has no driver for this machine.

@@ -27,15 +27,15 @@ pub enum DeviceError {
     Unreachable { machine: Arc<str>, kind: std::io::ErrorKind, limit: Duration },
     /// The connection exists, but no answer arrived in time.
     #[error(
-        "{machine} did not answer ({operation}) within {} ms. Check the line, the load of the line and the unit \
-         number. On a serial line, also check baud rate and parity",
+        "{machine} did not answer ({operation}) within {} ms. Check the cable, the traffic on the line and the \
+         unit number. On a serial line, also check baud rate and parity",
         .limit.as_millis()
     )]
     TimedOut { machine: Arc<str>, operation: &'static str, limit: Duration },
     /// The machine, or a device between, closed the connection.
     #[error(
-        "{machine} closed the connection ({operation}). Check whether another client uses the only connection of the \
-         machine, or whether the machine was restarted"
+        "{machine} closed the connection ({operation}). Check whether another client uses the only connection that \
+         the machine allows, or whether the machine was restarted"
     )]
     Disconnected { machine: Arc<str>, operation: &'static str },
     /// The received data are inconsistent: wrong length, echo, checksum or page.
@@ -46,9 +46,8 @@ pub enum DeviceError {
     Corrupt { machine: Arc<str>, data: &'static str, expected: u64, found: u64 },
     /// The connection works, but the machine's application has stopped.
     #[error(
-        "{machine} answers, but its application has stopped: its heartbeat counter has stayed at {beat} for {} ms \
-         (limit \
-         {} ms). Check the machine; do not rely on its values",
+        "{machine} answers, but the machine's program has stopped: its heartbeat counter has stayed at {beat} for \
+         {} ms (limit {} ms). Check the machine; do not rely on its values",
         .unchanged_for.as_millis(), .limit.as_millis()
     )]
     Frozen { machine: Arc<str>, beat: u16, unchanged_for: Duration, limit: Duration },
@@ -56,8 +55,7 @@ pub enum DeviceError {
     /// it later.
     #[error(
         "{machine} did not acknowledge {command} number {sequence} after {tries} tries; the last acknowledged number \
-         is {acknowledged}. Check whether the application of the machine has stopped, and whether its program follows \
-         docs/modbus.md"
+         is {acknowledged}. Check that the machine's program runs and follows docs/modbus.md"
     )]
     NotAcknowledged { machine: Arc<str>, command: MachineCommand, sequence: u32, acknowledged: u32, tries: u32 },
     /// It is unknown whether the job was begun. The start is never repeated; see
@@ -74,7 +72,7 @@ pub enum DeviceError {
     )]
     Interrupted { machine: Arc<str>, payload: &'static str, done: u32, total: u32 },
     /// The driver was used before [`Machine::connect`](super::Machine::connect).
-    #[error("{machine} was used ({operation}) before it was connected")]
+    #[error("{machine} was used ({operation}) before Regrind connected to the machine; connect first")]
     NotConnected { machine: Arc<str>, operation: &'static str },
 
     /// The machine is of the right kind, but it is not the one that the cell file names.
@@ -91,7 +89,10 @@ pub enum DeviceError {
     )]
     SimulationMismatch { machine: Arc<str>, simulation: bool },
     /// An operator confirmation was given for a machine that needs none.
-    #[error("{machine} reports the begin and the end of a job itself; no confirmation is required")]
+    #[error(
+        "the confirmation was not used, because {machine} itself reports the begin and the end of a job; no \
+         confirmation is required"
+    )]
     ConfirmationNotNeeded { machine: Arc<str> },
     /// An operator confirmation did not name the map with which the machine works.
     #[error(
@@ -139,7 +140,7 @@ pub enum DeviceError {
     PayloadRefused { machine: Arc<str>, payload: &'static str, answer: Answer },
     /// The machine answered with a Modbus exception. Addresses count from 0.
     #[error(
-        "{machine} answered exception {code} ({}) to {operation} at register {address}: {}",
+        "{machine} answered a request ({operation}, register {address}) with the Modbus exception {code} ({}): {}",
         exception_in_words(*.code), exception_remedy(*.code)
     )]
     Exception { machine: Arc<str>, operation: &'static str, address: u16, code: u8 },
@@ -168,8 +169,8 @@ pub enum DeviceError {
     WrongWordOrder { machine: Arc<str>, configured: &'static str, matching: Option<&'static str> },
     /// The machine uses another version of the map.
     #[error(
-        "{machine} has version {found} of the register map, but this program requires version {required}: {}; nothing \
-         was written to the machine",
+        "{machine} has version {found} of the register map, but Regrind requires version {required}: {}; nothing was \
+         written to the machine",
         version_in_words(*.found, *.required)
     )]
     WrongVersion { machine: Arc<str>, required: u16, found: u16 },
@@ -177,8 +178,8 @@ pub enum DeviceError {
     #[error(
         "{machine} belongs to {}",
         match .owner {
-            0 => "no client now: the machine has lost its client, for example by a restart of its application; check \
-                  the machine before the run continues".to_owned(),
+            0 => "no client now: the machine no longer knows Regrind as its client, for example after a restart of \
+                  the machine's program; check the machine before the run continues".to_owned(),
             owner => format!("another client now (owner {owner:08x}, this client is {ours:08x}): find that client; one \
                               of the two clients must release the machine"),
         }
@@ -186,7 +187,7 @@ pub enum DeviceError {
     OwnedByOther { machine: Arc<str>, ours: u32, owner: u32 },
     /// The machine works in inches (unit code 2), or gives no known unit (1 is mm).
     #[error(
-        "{machine} gives lengths in {}, and this program accepts only mm: set the machine to mm",
+        "{machine} gives lengths in {}, but Regrind accepts only mm: set the machine to mm",
         if *.unit == 2 { "inches" } else { "an unknown unit" }
     )]
     WrongLengthUnit { machine: Arc<str>, unit: u16 },
@@ -198,8 +199,8 @@ pub enum DeviceError {
     Restarted { machine: Arc<str>, old_boot_id: u32, new_boot_id: u32 },
     /// A received value is not a finite number.
     #[error(
-        "{machine}: {field} is {value}, which is not a finite number; the value was rejected. Check the machine's \
-         program: does it set this value, and in the same word order as its sentinels (docs/modbus.md)?"
+        "{machine}: {field} is {value}, which is not a finite number; the value was rejected. Check that the \
+         machine's program sets this value, in the same word order as its test values (sentinels, docs/modbus.md)"
     )]
     NotFinite { machine: Arc<str>, field: String, value: f64 },
     /// A received value is outside its possible range.
@@ -219,8 +220,8 @@ pub enum DeviceError {
     WrongCount { machine: Arc<str>, elements: &'static str, expected: u64, found: u64 },
     /// The machine holds something else than was sent, or something of another job.
     #[error(
-        "{machine}: {field} is {found:#x} at the machine, but {sent:#x} in Regrind: the machine would use wrong data. \
-         Load the data again"
+        "{machine}: {field} is {found:#x} at the machine, but {sent:#x} in Regrind. The two values \
+         must be equal: the machine has other data than Regrind. Check which job the machine has"
     )]
     Mismatch { machine: Arc<str>, field: &'static str, sent: u64, found: u64 },
     /// A result was requested, but there is none.
@@ -273,9 +274,8 @@ pub enum DeviceError {
     },
     /// A controller does not answer as linuxcncrsh does.
     #[error(
-        "{machine} does not answer like linuxcncrsh: the answer to {request} was {reply:?}. Only queries were sent. \
-         Check host and \
-         port in the cell file"
+        "{machine} does not answer like linuxcncrsh: the answer to {request} was {reply:?}. Regrind \
+         sent only queries, which change nothing at the machine. Check host and port in the cell file"
     )]
     NotLinuxcnc { machine: Arc<str>, request: &'static str, reply: String },
     /// A controller refused a password.
@@ -329,14 +329,14 @@ impl DeviceError {
 /// `required` of this program, and what to update.
 fn version_in_words(found: u16, required: u16) -> String {
     if found > required {
-        return "this program is older and does not know the newer map: update this program".to_owned();
+        return "this version of Regrind is older than the map and does not know this map: update Regrind".to_owned();
     }
     let lacks = [
         "a heartbeat that names its owner (without the owner, the heartbeat of any client keeps the machine moving)",
-        "a CLAIM after which the machine must refuse a late START with a lower number",
-        "an ABORT that the machine accepts from any client, with any number",
-        "a register `done` that remains after CLEAR and contains the number of the START whose job has ended",
-        "a measuring plan that begins slowly at targets where the part may be displaced",
+        "a CLAIM command that makes the machine refuse a late START with a lower number",
+        "an ABORT command that the machine accepts from any client, with any sequence number",
+        "a register `done` whose value remains after CLEAR and is the number of the START of the ended job",
+        "a measuring plan whose first targets can have a slow speed, because the part may be displaced there",
     ];
     format!(
         "the machine's program lacks {}; update it to version {required} (docs/modbus.md, \"What version 2 changed\")",

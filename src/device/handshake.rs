@@ -299,25 +299,27 @@ impl fmt::Display for Answer {
             Self::None => "no answer yet",
             Self::Accepted => "accepted",
             Self::NotOwner => {
-                "another client owns the machine, or has owned the machine since this client started: end that \
-                 client, then claim the machine again"
+                "another client owns the machine, or owned the machine after Regrind had connected: end that client, \
+                 then let Regrind connect to the machine again"
             }
             Self::WrongState => "the machine does not allow this command in its present state",
             Self::UnknownCommand => {
                 "the machine does not know the command: compare the machine's program with docs/modbus.md"
             }
             Self::DeadToken => {
-                "the token of the prepared job has expired (30 s passed, or an interlock opened): prepare the job \
-                 again"
+                "the token of the prepared job has expired (30 s passed, or an interlock opened): resume, and Regrind \
+                 prepares the job again"
             }
             Self::OtherJob => {
-                "job, cycle or payloads differ from the prepared ones: load the payloads and prepare the job again"
+                "job, cycle or payloads differ from the prepared ones: resume, and Regrind sends the payloads and \
+                 prepares the job again"
             }
             Self::AlreadyBegun => {
                 "this cycle of the job has already begun; the machine does not begin the same cycle twice"
             }
             Self::PayloadMissing => {
-                "a payload is missing, damaged, or for another part: check the part, and load the payload again"
+                "a payload is missing, damaged, or for another part: check the part; then resume, and Regrind sends \
+                 the payload again"
             }
             Self::InterlockOpen => {
                 "an interlock is open or the machine is not in automatic mode: close the guards, select \
@@ -327,7 +329,8 @@ impl fmt::Display for Answer {
                 "a value of the payload is outside the machine's limits: compare the recipe with these limits"
             }
             Self::OtherResult => {
-                "the acknowledged result is not the present result of the machine: collect the result again"
+                "Regrind acknowledged another result than the present result of the machine: check which job the \
+                 machine ran"
             }
             Self::Unlisted(number) => {
                 return write!(f, "answer {number}, which docs/modbus.md does not list: correct the machine's program");

@@ -13,8 +13,8 @@ pub enum PlanMismatch {
     EqualsPlan,
     /// Points that are too far from their targets, for every pose of the part in its fixture.
     #[error(
-        "all points were fitted to the plan: touched point {number} is still {distance_mm:.3} mm from its target (limit \
-         {limit_mm:.1} mm), and the fit turns the points by {rotation_deg:.1}° (limit {MAX_ROTATION_DEG:.0}°). Check \
+        "the points do not fit the plan. After the best fit, touched point {number} is {distance_mm:.3} mm from its target \
+         (limit {limit_mm:.1} mm). This fit turns the points by {rotation_deg:.1}° (limit {MAX_ROTATION_DEG:.0}°). Check \
          that the rows are in the order of the plan, and that the plan is of this part"
     )]
     OffTarget {

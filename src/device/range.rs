@@ -29,7 +29,7 @@ const COORDINATE: ValueRange = range("a coordinate", -1e5, 1e5, "mm");
 const QUALITY: ValueRange = range("the quality of a point", 0.0, 100.0, "");
 const COUNT: ValueRange = range("the scale of counts", 1e-9, 0.1, "mm");
 const SPINDLE_LOAD: ValueRange = range("the spindle load", 0.0, 10.0, "");
-const IDLE_SHARE: ValueRange = range("the share of the path that cut nothing", 0.0, 1.0, "");
+const IDLE_SHARE: ValueRange = range("the share of the path without removal", 0.0, 1.0, "");
 
 /// All ranges that apply to every machine. The ranges of a pass that depend on the command are in
 /// `drive/pass_record.rs`.

@@ -167,8 +167,10 @@ fn reason_message(why: Reason) -> &'static str {
         Reason::CorrectionPreferred => "another pass improves the part more than further touches do",
         Reason::AllTargetsTried => "every target was touched",
         Reason::TooFewTouches => "too few touches for a decision",
-        Reason::LargeInnovations => "the last touches deviate from the prediction",
-        Reason::UnconfirmedOutlier => "a touch is an outlier, and too few touches near this touch confirm or reject it",
+        Reason::LargeInnovations => "the last touches deviate from the prediction by more than expected",
+        Reason::UnconfirmedOutlier => {
+            "a touch is possibly an outlier, and too few touches are near this touch to confirm the outlier"
+        }
         Reason::NarrowFeature => "the part has a narrow feature, so every target is touched",
         Reason::Undecided => "the touches do not yet show whether the part is in tolerance",
         Reason::FormUnknown => "the form is not known well enough for a correction",

@@ -431,7 +431,7 @@ impl Drive {
     async fn handle_panic(&mut self, error: JoinError) {
         let Some((cycle, kind)) = self.running_computations.remove(&error.id()) else { return };
         let why = format!(
-            "the computation failed because of a fault of the program; report this fault: {}",
+            "the computation failed because of a fault of the program Regrind; report this fault: {}",
             panic_message(error)
         );
         let event = match kind {
@@ -489,7 +489,7 @@ impl Drive {
     /// or the cell changed its state before the record was written. Does nothing for other commands.
     async fn report_start_not_sent(&mut self, command: Command) {
         if let Command::StartMachine { device, .. } = command {
-            let why = "START was not sent: START could not be recorded, or the cell was held first".to_owned();
+            let why = "START was not sent, because START could not be recorded, or because the cell was held before START was recorded".to_owned();
             self.handle_event(Event::Refused { device, what: MachineRequest::Start, why }, None).await;
         }
     }
@@ -551,7 +551,7 @@ impl Drive {
             match std::mem::replace(&mut waiting.action, RecordAction::Nothing) {
                 RecordAction::Answer { answer, message, .. } => {
                     let message = format!(
-                        "{message}; only steps that make the cell safe were carried out; the order was not recorded: {why}"
+                        "{message}; only the steps that make the cell safe were carried out, because the order was not recorded: {why}"
                     );
                     // The person who asked may be gone.
                     drop(answer.send(Reply { taken: false, message, status: status.clone() }));
@@ -1263,7 +1263,7 @@ async fn wait_for_first_record(backlog: &mut VecDeque<PendingRecord>) -> Result<
     match backlog.front_mut() {
         Some(next) => (&mut next.receipt).await.unwrap_or_else(|_| {
             Err(RecordFailure::Unwritable(
-                "the part of this program that writes the record has stopped; report this fault".into(),
+                "the journal writer of Regrind has stopped, so nothing can be recorded; report this fault".into(),
             ))
         }),
         None => std::future::pending().await,

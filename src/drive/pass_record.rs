@@ -42,7 +42,7 @@ pub(super) fn implausible_figure(told: &CommandedPass, record: &PassRecord) -> O
     if (record.job, record.cycle) != (job.job, job.cycle) {
         let (is_job, is_cycle) = (record.job, record.cycle);
         return Some(format!(
-            "the record belongs to job {is_job}, cycle {is_cycle}, but the pass to job {}, cycle {}",
+            "the record belongs to job {is_job}, cycle {is_cycle}, but the pass belongs to job {}, cycle {}",
             job.job, job.cycle
         ));
     }
@@ -193,11 +193,11 @@ mod tests {
             ),
             (
                 PassRecord { job: 40, ..record() },
-                "the record belongs to job 40, cycle 2, but the pass to job 41, cycle 2",
+                "the record belongs to job 40, cycle 2, but the pass belongs to job 41, cycle 2",
             ),
             (
                 PassRecord { cycle: 1, ..record() },
-                "the record belongs to job 41, cycle 1, but the pass to job 41, cycle 2",
+                "the record belongs to job 41, cycle 1, but the pass belongs to job 41, cycle 2",
             ),
             (PassRecord { max_depth_mm: Some(3.0), ..record() }, "3.000 mm, maximum 0.535 mm"),
             (PassRecord { path_mm: Some(-1.0), ..record() }, "the path travelled is -1.000 mm, minimum 6324.000 mm"),

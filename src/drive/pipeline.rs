@@ -164,7 +164,7 @@ fn check_control_points(
     match changes_mm.get(1) {
         Some(&second_mm) if second_mm <= limit_mm => Ok(()),
         Some(&second_mm) => Err(GateFailure::Moved(format!(
-            "{} control points are too far from their first touches; the second largest distance is {:.2} µm, limit {:.2} µm",
+            "{} control points were touched again, and the second touch is too far from the first touch; the second largest distance is {:.2} µm, limit {:.2} µm",
             changes_mm.iter().filter(|&&change| change > limit_mm).count(),
             1e3 * second_mm,
             1e3 * limit_mm,
@@ -520,8 +520,11 @@ fn register_and_evaluate(
         let message = "the measurement has no temperature, so the thermal expansion of the part is not compensated (part.expansion_um_m_k)";
         figures.warnings.push(message.to_owned());
     }
-    let untold =
-        |error: &String| format!("form and noise cannot be separated, so the stated uncertainty is too small: {error}");
+    let untold = |error: &String| {
+        format!(
+            "the form error of the part and the noise of the probe cannot be separated, so the stated uncertainty is too small: {error}"
+        )
+    };
     if next.is_none() {
         figures.warnings.extend(form.as_ref().err().map(untold));
     }

@@ -68,7 +68,7 @@ pub enum ProgramError {
     #[error(transparent)]
     File(#[from] GcodeError),
     #[error(
-        "the program of the next pass would have {points} points, limit {MAX_PROGRAM_POINTS}; allow a larger chord error, or write \
+        "the program of the next pass would have {points} points, limit {MAX_PROGRAM_POINTS}; increase grinding.chord_error_um in the recipe, or write \
          the program with `regrind plan --program`"
     )]
     TooLong { points: u64 },
@@ -315,7 +315,7 @@ pub(super) fn describe_parameter_corrections(correction: &Correction, wheel_radi
             ParameterKind::WheelRadius => {
                 let true_mm = wheel_radius_mm + value;
                 format!(
-                    "{said}, {true_mm:.6} mm instead of {wheel_radius_mm} mm, compensated since pass {since} by the wheel radius, not by the map"
+                    "{said}, {true_mm:.6} mm instead of {wheel_radius_mm} mm; since pass {since} the true wheel radius compensates this error, not the map"
                 )
             }
             _ => format!("{said}; compensated since pass {since} by the map"),
@@ -346,7 +346,7 @@ fn describe_tracks(path: &ToolPath) -> String {
         TrackSpacing::Distance(_) => String::new(),
     };
     format!(
-        "{} track pieces, {:.6} mm apart, {pattern}{scallop}, chords within {:.4} um, overrun {} mm",
+        "{} track pieces, {:.6} mm apart, {pattern}{scallop}, chord error at most {:.4} um, overrun {} mm",
         path.track_count(),
         path.track_mm(),
         1e3 * options.chord_error_mm,

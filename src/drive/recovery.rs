@@ -40,7 +40,9 @@ pub enum RecoveryError {
     Device(#[from] DeviceError),
     #[error(transparent)]
     Journal(#[from] JournalError),
-    #[error("the {device} was {shown} and is now {found}; no command was sent; check the machine again")]
+    #[error(
+        "the state of the {device} changed from {shown} to {found}, so no command was sent; check the machine again"
+    )]
     Changed { device: Device, shown: String, found: String },
     #[error("the {device} is still {found} after {} s; check the machine, then run the command again", .limit.as_secs())]
     TimedOut { device: Device, found: MachineState, limit: Duration },
@@ -71,7 +73,7 @@ impl RecoveryStep {
     pub fn consequence(self, device: Device) -> &'static str {
         match (self, device) {
             (Self::Stop, _) => {
-                "ends the running job normally, clear of the part; if no job runs, cancels the prepared job"
+                "ends the running job and leaves the machine clear of the part; if no job runs, cancels the prepared job"
             }
             (Self::Acknowledge, Device::Cmm) => {
                 "discards the result of the CMM: a measurement that no run has collected is lost"
@@ -80,7 +82,7 @@ impl RecoveryStep {
                 "discards the result of the grinder: the part was ground with this pass, but no record will contain this pass"
             }
             (Self::Clear, _) => {
-                "returns the machine to idle: first check that the machine is at rest and clear of the part, and why the machine was stopped"
+                "returns the machine to idle: first check that the machine is at rest and clear of the part, and find out why the machine was stopped"
             }
         }
     }

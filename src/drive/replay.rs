@@ -363,7 +363,10 @@ impl<'t> Replay<'t> {
             let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
             let Some(recorded) = self.files.get(&(number, name.to_owned())) else { continue };
             if !path.is_file() {
-                return Err(self.differs(format!("the repeated computation does not write the file {}", recorded.name)));
+                return Err(self.differs(format!(
+                    "the repeated computation does not write the file {}, but the record has this file",
+                    recorded.name
+                )));
             }
             let bytes = fs::read(&path).map_err(|source| ReplayError::Scratch { path, source })?;
             if sha256_hex(&bytes) != recorded.sha256

@@ -332,7 +332,7 @@ impl<B: StationDriver> MachineTask<B> {
     ) {
         let (reports, name) = (self.reports.clone(), B::DEVICE);
         let Err(error) = tokio::spawn(self.serve_requests(asks, poll, aborts, pulse)).await else { return };
-        let why = format!("a fault of the program; report this fault: {}", panic_message(error));
+        let why = format!("a fault of the program Regrind; report this fault: {}", panic_message(error));
         let event = Some(Event::StationFailed { device: name, why });
         let _ = reports.send(StationReport { event, ..StationReport::default() }).await;
     }
@@ -672,7 +672,9 @@ impl<B: StationDriver> MachineTask<B> {
     async fn reconcile(&mut self, cycle: u32) {
         let Some(armed) = self.armed.clone().filter(|armed| armed.job.batch_id().cycle == cycle) else {
             // The machine cannot be asked about a job that this program has not prepared, and nothing is concluded.
-            let why = "this program has not prepared the machine in this cycle".to_owned();
+            let why =
+                "Regrind has not prepared the machine in this cycle, so Regrind cannot ask the machine about the job"
+                    .to_owned();
             let outcome = Reconciliation::Unknown(why);
             return self.report(Event::Reconciled { device: B::DEVICE, cycle, outcome }).await;
         };
@@ -707,7 +709,8 @@ impl<B: StationDriver> MachineTask<B> {
     async fn collect(&mut self, cycle: u32) {
         let armed = self.armed.as_ref().filter(|armed| armed.job.batch_id().cycle == cycle);
         let Some(job) = armed.map(|armed| armed.job) else {
-            let why = "this program has not prepared the machine for a job of this cycle".to_owned();
+            let why = "Regrind has not prepared the machine for a job of this cycle, so there is no result to collect"
+                .to_owned();
             return self.report(Event::Refused { device: B::DEVICE, what: MachineRequest::Collect, why }).await;
         };
         match self.driver.fetch(job, &self.interrupt).await {
@@ -1120,8 +1123,8 @@ fn fault_message(device: Device, fault: Fault) -> String {
     match (device, fault) {
         // A probe that meets material where only air should be is not at fault: the part is in another place.
         (Device::Cmm, Fault::Collision) => {
-            "the probe touched material where the plan expects only air: check the position of the part (turned, in another \
-             seat, another part) and the probe, then clear the machine"
+            "the probe touched material where the plan expects only air: check the position of the part. Is this the right \
+             part, in the right seat, and not turned? Check the probe, then clear the fault of the machine"
                 .to_owned()
         }
         (_, fault) => fault.to_string(),

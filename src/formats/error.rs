@@ -21,7 +21,7 @@ pub enum FormatError {
     #[error("{path}: the file has {found} {unit}, more than the limit of {limit}; reduce or split the file")]
     TooLarge { path: PathBuf, found: u64, limit: u64, unit: &'static str },
     /// The file has no content at all.
-    #[error("{path}: the file is empty, expected {expected}; export it again")]
+    #[error("{path}: the file is empty, expected {expected}; export the file again")]
     Empty { path: PathBuf, expected: &'static str },
     /// The file is well formed, but contains no data.
     #[error("{path}: the file has no {expected}; export the file again with its data")]
@@ -106,12 +106,12 @@ pub enum FormatError {
     Unit { path: PathBuf, line: u64, found: String, unit: Unit },
     /// A text file that ends in the middle of a line.
     #[error(
-        "{path}, line {line}: the file is cut in the middle of a line, found {}; copy or export it again",
+        "{path}, line {line}: the file ends too early, in the middle of a line, found {}; copy or export the file again",
         quoted(found)
     )]
     CutLine { path: PathBuf, line: u64, found: String },
     /// A file that ends before the amount of data that it announced.
-    #[error("{path}, {place}: the file is cut, expected {expected}; copy or export it again")]
+    #[error("{path}, {place}: the file ends too early, expected {expected}; copy or export the file again")]
     Cut { path: PathBuf, place: String, expected: String },
     /// Content that differs from what the format requires.
     #[error("{path}, {place}: expected {expected}, found {}; export the file again", quoted(found))]
@@ -169,7 +169,9 @@ pub enum FormatError {
     #[error("{path}: {key}: {found} in this file, but {expected} in the {by}; correct one of them")]
     Contradiction { path: PathBuf, key: &'static str, found: String, by: &'static str, expected: String },
     /// A target number that the plan does not have, or that occurred before.
-    #[error("{path}, line {line}: index `{found}` {why}; export the measurement of this plan")]
+    #[error(
+        "{path}, line {line}: index `{found}` {why}; export the result again, with the target numbers of the plan as the index"
+    )]
     Index { path: PathBuf, line: u64, found: String, why: &'static str },
     /// More than one probe in the same file.
     #[error(

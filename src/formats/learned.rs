@@ -83,7 +83,7 @@ struct Head {
 pub enum LearnedError {
     #[error(transparent)]
     File(#[from] FormatError),
-    #[error("{path}: {why}; copy the run again from its archive")]
+    #[error("{path}: this file cannot be used: {why}; copy the folder of this run from the archive again")]
     Broken { path: PathBuf, why: String },
 }
 
@@ -375,7 +375,8 @@ mod tests {
                 error
             })
         };
-        assert!(broken("\"columns\":5", "\"columns\":6")[0].contains("20 values for a grid of 6 x 4 nodes"));
+        let [error, _] = broken("\"columns\":5", "\"columns\":6");
+        assert!(error.contains("20 values") && error.contains("6 x 4 nodes"), "{error}");
         assert!(broken("\"columns\":5,\"rows\":4", "\"columns\":0,\"rows\":0")[0].contains("0 x 0"));
         assert!(broken("\"spacing_mm\":[1.0,1.0]", "\"spacing_mm\":[0.0,1.0]")[0].contains("0 x 1 mm apart"));
         assert!(broken("\"response\":[1.0", "\"response\":[7.0")[0].contains("impossible"));

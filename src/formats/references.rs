@@ -226,24 +226,29 @@ mod tests {
         let named = yaml(text, Some("primary")).unwrap();
         assert_eq!(named[0], Reference { name: Some("a".into()), at: Point::new(2400.94, -2698.56, 4819.33) });
         assert_eq!(named[1].name.as_deref(), Some("b"));
-        let message = yaml(text, None).unwrap_err().to_string();
-        assert!(message.contains("there are primary, bearing"), "{message}");
+        let refused = yaml(text, None).unwrap_err();
+        assert!(matches!(&refused, FormatError::Group { there, .. } if there == "primary, bearing"), "{refused}");
         assert_eq!(yaml("[[1,2,3],[4,5,6]]", None).unwrap().len(), 2);
     }
 
     #[test]
     fn references_errors_name_their_line() {
-        for (text, expected) in [
-            ("p:\n- [1, 2]\n", "line 2: expected three finite numbers in mm, found 2 entries"),
-            ("p:\n- [1, 2, 3]\n- [1, .nan, 3]\n", "line 3: expected three finite numbers in mm, found `.nan`"),
-            ("p:\n- [1, 2, x]\n", "found `x`"),
-            ("p: &a [1, 2, 3]\nq: [*a, *a]\n", "found an alias"),
-            ("p: [1, 2\n", "expected YAML"),
-            ("", "found nothing"),
-            ("p: {a: [1, 2, 3], a: [1, 2, 3]}", "again"),
+        // Text, its faulty line if that is compared, and what was expected or found there.
+        for (text, at_line, what) in [
+            ("p:\n- [1, 2]\n", Some(2), "2 entries"),
+            ("p:\n- [1, 2, 3]\n- [1, .nan, 3]\n", Some(3), "`.nan`"),
+            ("p:\n- [1, 2, x]\n", None, "`x`"),
+            ("p: &a [1, 2, 3]\nq: [*a, *a]\n", None, "an alias"),
+            ("p: [1, 2\n", None, "YAML"),
+            ("", None, "nothing"),
+            ("p: {a: [1, 2, 3], a: [1, 2, 3]}", None, "`a` again"),
         ] {
-            let message = yaml(text, None).unwrap_err().to_string();
-            assert!(message.contains(expected), "{text:?}: {message}");
+            let refused = yaml(text, None).unwrap_err();
+            let FormatError::Reference { line, expected, found, .. } = &refused else { panic!("{text:?}: {refused}") };
+            assert!(
+                at_line.is_none_or(|at| at == *line) && [*expected, found.as_str()].contains(&what),
+                "{text:?}: {refused}"
+            );
         }
         let deep = "[".repeat(5000);
         assert!(yaml(&deep, None).is_err());

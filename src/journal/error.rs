@@ -20,7 +20,7 @@ pub enum JournalError {
     #[error("{path}: there is no journal.sqlite in this folder; give the folder of a run")]
     Absent { path: PathBuf },
     /// The file is not a journal.
-    #[error("{path}: this is not a journal of Regrind: {what}; give the folder of a run")]
+    #[error("{path}: this file is not a journal of Regrind: {what}; give the folder of a run")]
     Foreign { path: PathBuf, what: &'static str },
     /// The journal was made by a later version.
     #[error(
@@ -30,7 +30,7 @@ pub enum JournalError {
     Newer { path: PathBuf, found: u32, limit: u32 },
     /// Another process drives the run.
     #[error(
-        "{path}: another process controls this run; wait until that process ends, or order a hold or a stop of the run"
+        "{path}: another process controls this run; wait until that process ends, or send an order to the run with `regrind hold` or `regrind stop`"
     )]
     Busy { path: PathBuf },
     /// Another run has the machine.
@@ -40,7 +40,7 @@ pub enum JournalError {
     )]
     MachineTaken { address: String, holder: String },
     /// The folder for the locks of machines is not safe to use: another user could have created it.
-    #[error("{path}: this folder must hold the locks of the machines, but is not safe: {what}; {remedy}")]
+    #[error("{path}: this folder is for the lock files of the machines, but the folder is not safe: {what}; {remedy}")]
     LockFolder { path: PathBuf, what: String, remedy: String },
     /// The run is over.
     #[error("{path}: the journal is closed, because its run is over; begin another run")]
@@ -52,7 +52,7 @@ pub enum JournalError {
     )]
     File { path: PathBuf, action: &'static str, source: io::Error },
     /// The disk is full.
-    #[error("{path}: the disk is full; free space on it and resume the run")]
+    #[error("{path}: the disk is full; make free space on this disk, then continue the run with `regrind resume`")]
     DiskFull { path: PathBuf },
     /// The database did not accept a setting that the guarantees depend on.
     #[error(
@@ -68,7 +68,7 @@ pub enum JournalError {
     Database { path: PathBuf, source: rusqlite::Error },
     /// The journal was changed, or the disk has damaged it.
     #[error(
-        "{path}: the journal is broken at record {seq}: {what}; keep the folder as it is and compare it with its copies"
+        "{path}: the journal is broken at record {seq}: {what}; do not change the folder of the run; compare the journal with the copies of the journal"
     )]
     Broken { path: PathBuf, seq: u64, what: String },
     /// The record is intact, but it is not signed with one of the given keys.
@@ -112,10 +112,12 @@ pub enum JournalError {
     )]
     Recorded { path: PathBuf },
     /// The entry is not allowed at this place of the journal.
-    #[error("a record of kind {kind} {what}; this is a fault of the program: report it")]
+    #[error("a record of the kind {kind} cannot be written: this record {what}; report this fault of the program")]
     Entry { kind: &'static str, what: &'static str },
     /// All command numbers are used up.
-    #[error("all command numbers up to {limit} are used; begin another run")]
+    #[error(
+        "this run has used all command numbers up to {limit}, and cannot send another command to a machine; begin another run"
+    )]
     CommandNumbers { limit: u32 },
 }
 

@@ -15,7 +15,9 @@ use thiserror::Error;
 pub enum LiveError {
     #[error(transparent)]
     Trust(#[from] TrustError),
-    #[error("{of} {name:?} cannot be a part of a topic: the name is empty or contains +, / or #; choose another name")]
+    #[error(
+        "the name {name:?} of {of} cannot be a part of an MQTT topic, because the name is empty or contains +, / or #; choose another name"
+    )]
     Topic { of: &'static str, name: String },
     #[error("{}: the state of the publisher cannot be stored in this folder: {source}; check that the folder exists, and that you have the right to write in it", .path.display())]
     Folder { path: PathBuf, source: io::Error },

@@ -433,7 +433,7 @@ pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> 
     foreign_origin(guard, headers).or_else(|| {
         let token = text(headers, HeaderName::from_static(TOKEN)).unwrap_or_default();
         (!guard.takes_token(session, token))
-            .then(|| "an order without a token of this page, or with a token that was already used".into())
+            .then(|| "an order that is not allowed, because its token of this page is missing or was already used; load the page again in the browser".into())
     })
 }
 
@@ -470,7 +470,9 @@ fn shut_out(guard: &Guard, request: &Request, told: Option<bool>) -> Response {
 fn not_signed_in(guard: &Guard, request: &Request) -> Response {
     if request.method() != "GET" {
         let path = printable(request.uri().path());
-        guard.record_refusal(&format!("an order to {path} from a person who has not signed in"));
+        guard.record_refusal(&format!(
+            "an order to the address {path} that is not allowed, because the person has not signed in"
+        ));
     }
     view::sign_in(StatusCode::UNAUTHORIZED, guard.subject, request.headers(), None)
 }

@@ -55,7 +55,7 @@ pub(crate) async fn order(
         return refuse(
             &page,
             &run,
-            "a request that is not one of the orders that this page can give".into(),
+            "a request that is not allowed, because this page has no such order".into(),
             StatusCode::BAD_REQUEST,
         )
         .await;
@@ -108,7 +108,7 @@ async fn clears_alarm_of_another(folder: &std::path::Path, session: &Session) ->
     let Reply { status, .. } = give(folder.to_owned(), Request::Status, session).await.ok()?;
     let theirs = status.alarms.iter().find(|alarm| alarm.clears == Role::ProcessEngineer)?;
     Some(format!(
-        "the order resume from {person}: an alarm is active that only an engineer can clear: \"{}\"",
+        "the order resume from {person}, which is not allowed, because only an engineer can clear the active alarm \"{}\"",
         theirs.what
     ))
 }

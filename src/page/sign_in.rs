@@ -196,7 +196,9 @@ pub(crate) async fn sign_in(
     }
     let (who, name) = (printable(&given.name), given.name.trim().to_lowercase());
     if !guard.signed_in.may_try(from, &name) {
-        let what = format!("a sign-in as {who} from {from}, after too many attempts within a minute");
+        let what = format!(
+            "a sign-in that is not allowed because of too many attempts within one minute, with the name {who} from the address {from}"
+        );
         return refuse(StatusCode::TOO_MANY_REQUESTS, what, Text::TooManyTries);
     }
     let waiting = guard.signed_in.wait_a_while(from).await;
@@ -206,12 +208,14 @@ pub(crate) async fn sign_in(
     };
     let Some(turn) = turn else {
         let what = format!(
-            "a sign-in as {who} from {from}, which could not start in time because other sign-ins were in progress"
+            "a sign-in that is not possible now because other sign-ins are in progress, with the name {who} from the address {from}"
         );
         return refuse(StatusCode::SERVICE_UNAVAILABLE, what, Text::TooManyTries);
     };
     let Some(proven) = prove(&guard, turn, given).await else {
-        let what = format!("a sign-in with a wrong name or password, as {who} from {from}");
+        let what = format!(
+            "a sign-in that is not allowed because of a wrong name or password, with the name {who} from the address {from}"
+        );
         return refuse(StatusCode::UNAUTHORIZED, what, Text::SignInRefused);
     };
     guard.signed_in.forget_tries(from, &name);

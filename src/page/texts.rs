@@ -184,7 +184,7 @@ texts! {
         "装上零件并夹紧。确认砂轮和测头已离开零件。然后按“零件已装好”。"
     }
     SeeClear {
-        "Check that this machine is clear of the part. Then press the button below. The machine:",
+        "Check that the machine at the end of this text is clear of the part. Then press the button below. Name of the machine:",
         "Prüfen, dass diese Maschine frei vom Teil ist, und bestätigen:",
         "确认此机器已离开零件："
     }
@@ -204,7 +204,7 @@ texts! {
         "按“继续”，或“结束运行”。"
     }
     SeeStands {
-        "Check that this machine is at rest. Then press RESUME: the cell asks the machine for the state of its job. If the machine cannot report this state, write below what you saw at the machine, and press ITS JOB IS OVER. The machine:",
+        "Check that the machine at the end of this text is at rest. Then press RESUME. The cell then asks the machine for the state of the job. If the machine cannot report this state, write what you saw at the machine in the field below. Then press ITS JOB IS OVER. Name of the machine:",
         "Prüfen, ob diese Maschine steht. Dann FORTSETZEN drücken: sie wird nach ihrem Auftrag gefragt; kann sie es nicht sagen, unten angeben:",
         "查看此机器是否静止。然后按“继续”，系统会询问其作业结果；若机器无法应答，请在下方说明："
     }

@@ -161,11 +161,11 @@ impl Users {
                 return wrong("the name is not allowed");
             }
             if users[..at].iter().any(|other| other.name == user.name) {
-                return wrong("another user in the list has the same name");
+                return wrong("another user in the list has the same name; remove one of the two users from the file");
             }
             if PasswordHash::new(&user.proof).is_err() {
                 return wrong(
-                    "the `proof` of this user is not a password hash; set the password again: regrind users add",
+                    "the `proof` of this user is not a password hash; remove this user from the file, then add the user again: regrind users add",
                 );
             }
         }

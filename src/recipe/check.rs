@@ -183,7 +183,7 @@ fn chosen_touches(written: &RecipeFile, document: &mut Document) {
         document.report(
             "measure.accepted_risk",
             format!(
-                "is {risk}, but `acceptance.probability` is {probability} and leaves a risk of {:.3}",
+                "is {risk}, but `acceptance.probability` = {probability} requires an accepted risk of at least {:.3}",
                 1.0 - probability
             ),
             "the accepted risk must be at least 1 minus the required probability",
@@ -393,7 +393,7 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
         document.report(
             KEY,
             "is set in a recipe that begins with a measurement",
-            "the estimate requires the error after the first pass, but this run measures before the first pass",
+            "the program estimates the parameters from the first measurement, so the run must grind before this measurement",
             "write `begin_with = \"grind\"`, or remove the table",
         );
     }
@@ -442,7 +442,7 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
             document.report(
                 &format!("{KEY}.{key}"),
                 "requires `registration.lock_uncertainty_um`",
-                "the uncertainty of the estimate cannot be less than the uncertainty of the fixture",
+                "the estimate cannot be more accurate than the fixture; `lock_uncertainty_um` is the uncertainty of the fixture",
                 "add `lock_uncertainty_um = 0.5` to [registration]",
             );
         }
@@ -470,7 +470,7 @@ fn grinding(written: &Grinding, document: &mut Document) {
         document.report(
             "grinding.one_way",
             "is set for a spiral",
-            "only the tracks of a raster can alternate in direction or all have one direction",
+            "`one_way` is only for a raster: all tracks of the raster then have the same direction",
             "remove `one_way`",
         );
     }
@@ -524,7 +524,7 @@ fn check_tables(written: &RecipeFile, document: &mut Document) {
         document.report(
             "grinding.allowance_um",
             format!("is {allowance} µm, too much for {cycles} cycles with a depth of cut of {depth} µm"),
-            "the first pass grinds to the allowance, and the last pass must reach the nominal surface",
+            "the first pass leaves the allowance on the part; the other passes must remove the allowance, and each pass removes at most one depth of cut",
             "lower `allowance_um`, or raise `cycle.max_cycles` or `compensation.depth_of_cut_um`",
         );
     }

@@ -448,7 +448,7 @@ mod tests {
         assert_eq!((pixel(0, 1), pixel(1, 1)), ([0x05, 0x30, 0x61, 255], [0xf7, 0xf7, 0xf7, 255]));
         assert!(pixel(0, 0)[..3].iter().all(|c| *c > 0xe0), "1 um is a tint: {:?}", pixel(0, 0));
         let svg = map.to_svg().unwrap();
-        assert!(svg.contains("66.7 % of the area within \u{b1} 1.50 µm"), "{svg}");
+        assert!(svg.contains("66.7 % of the area") && svg.contains("\u{b1} 1.50 µm"), "{svg}");
         roxmltree::Document::parse(&svg).unwrap();
         assert!(map.clone().with_tolerance(0.0).is_err() && map.with_tolerance(f64::NAN).is_err());
         // A tolerance beyond all values is still visible.
@@ -465,10 +465,8 @@ mod tests {
         let svg = map.to_svg().unwrap();
         let document = roxmltree::Document::parse(&svg).unwrap();
         let texts: Vec<_> = document.descendants().filter_map(|n| n.text()).collect();
-        for text in
-            ["Cycle 1", "mirror, SN 7", "PV of the map 0.00400 µm,", "RMS of the map 0.00129 µm, 6 nodes", "x / mm"]
-        {
-            assert!(texts.contains(&text), "{text} is not in {texts:?}");
+        for piece in ["Cycle 1", "mirror, SN 7", "map 0.00400 µm", "map 0.00129 µm, 6 nodes", "x / mm"] {
+            assert!(texts.iter().any(|text| text.contains(piece)), "{piece} is not in {texts:?}");
         }
         let size = |name: &str| document.root_element().attribute(name).unwrap().parse::<f64>().unwrap();
         assert!(size("width") < 400.0, "{}", size("width"));
@@ -532,8 +530,8 @@ mod tests {
         assert_eq!(svg, map.to_svg().unwrap());
         let document = roxmltree::Document::parse(&svg).unwrap();
         let texts: Vec<_> = document.descendants().filter_map(|n| n.text()).collect();
-        for text in ["1 < 2 & more", "PV 4.00 µm, RMS 1.29 µm, 6 points", "x / mm", "height / µm"] {
-            assert!(texts.contains(&text), "{text} is not in {texts:?}");
+        for piece in ["1 < 2 & more", "PV 4.00 µm", "RMS 1.29 µm", "6 points", "x / mm", "height / µm"] {
+            assert!(texts.iter().any(|text| text.contains(piece)), "{piece} is not in {texts:?}");
         }
         let image = document.descendants().find(|n| n.has_tag_name("image")).unwrap();
         let data = image.attribute("href").unwrap().strip_prefix("data:image/png;base64,").unwrap();

@@ -273,8 +273,8 @@ fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) ->
     list
 }
 
-const PV: &str = "largest minus smallest deviation from the nominal surface along its normal, all points";
-const RMS: &str = "root mean square of the deviations from the nominal surface along its normal";
+const PV: &str = "largest deviation minus smallest deviation of all points from the nominal surface, along the normal of the nominal surface";
+const RMS: &str = "root mean square of the deviations of the points from the nominal surface, along the normal of the nominal surface";
 
 const FORM_PV: &str = "largest deviation minus smallest deviation of the form from the nominal surface, along the normal of the nominal \
                        surface, after the best fit of the form, without the noise of the probe";
@@ -304,14 +304,14 @@ const AREAS: [(&str, &str, &str); 6] = [
     (
         "symmetric irregularity",
         "ISO 10110-5 C",
-        "peak to valley of the part of the irregularity that is rotationally symmetric about the centre",
+        "peak to valley of the rotationally symmetric component of the irregularity (symmetric about the centre)",
     ),
     ("RMSt", "ISO 10110-5 RMSt", "root mean square of the form without piston and tilt"),
     ("RMSi", "ISO 10110-5 RMSi", "root mean square of the form without piston, tilt and power"),
     (
         "RMSa",
         "ISO 10110-5 RMSa",
-        "root mean square of the part of the irregularity that is not rotationally symmetric about the centre",
+        "root mean square of the component of the irregularity that is not rotationally symmetric about the centre",
     ),
 ];
 

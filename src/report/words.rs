@@ -245,7 +245,7 @@ fn event_words(event: &Event) -> String {
         }
         Event::Registered { figures, .. } => figures_words(figures),
         Event::Compensated { summary, .. } => format!(
-            "largest correction {:.2} µm, largest removal {:.2} µm, part without wheel contact: {}, expected PV after the pass {:.2} µm{}",
+            "largest correction {:.2} µm, largest removal {:.2} µm, share of the part that the wheel does not touch: {}, expected PV after the pass {:.2} µm{}",
             1e3 * summary.largest_mm,
             1e3 * summary.depth_mm,
             in_air(summary.air_share),
@@ -280,7 +280,9 @@ fn mismatch_words(why: &ConnectionRefusal) -> String {
         ConnectionRefusal::Unreachable(words) => format!("unreachable: {words}"),
         ConnectionRefusal::WrongDevice(words) => format!("another device: {words}"),
         ConnectionRefusal::WordOrder(words) => {
-            format!("the word order of the machine differs from the word order in the cell file: {words}")
+            format!(
+                "the machine sends the registers of a value in another order (word order) than the cell file states: {words}"
+            )
         }
         ConnectionRefusal::Inches => "the machine works in inches".to_owned(),
         ConnectionRefusal::Owned(words) => format!("owned by another client: {words}"),
@@ -346,7 +348,7 @@ fn figures_words(figures: &Figures) -> String {
 pub(super) fn parameters_words(summary: &regrind_cell::CompensationSummary) -> Vec<String> {
     let told = summary.parameters.iter().map(regrind_cell::RecordedParameter::in_words);
     let left = summary.map_rms_mm.filter(|_| !summary.parameters.is_empty());
-    told.chain(left.map(|mm| format!("error that remains for the correction map: {:.2} µm RMS", 1e3 * mm))).collect()
+    told.chain(left.map(|mm| format!("error that the correction map must correct: {:.2} µm RMS", 1e3 * mm))).collect()
 }
 
 #[cfg(test)]

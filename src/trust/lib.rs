@@ -32,7 +32,7 @@ pub enum TrustError {
     #[error("{}: no certificates in PEM format can be read from this file: {what}; the file must contain the certificates of the issuer of the server certificate in PEM format", .path.display())]
     Certificates { path: PathBuf, what: String },
     #[error(
-        "{host} is another computer, but no certificates to authenticate the other computer are given; enter the path of the certificate file in the key `certificates` of {table}"
+        "{host} is another computer, but the certificates that Regrind needs to check the identity of that computer are missing; enter the path of the certificate file in the key `certificates` of {table}"
     )]
     Unproven { host: String, table: &'static str },
 }
@@ -106,8 +106,11 @@ mod tests {
             assert!(tls_config(here, None, "[database]").unwrap().is_none(), "{here}");
         }
         for other in ["plant", "localhost.example", "10.0.0.1", "::2", "0.0.0.0", ""] {
-            let refused = tls_config(other, None, "[database]").unwrap_err().to_string();
-            assert!(refused.starts_with(other) && refused.contains("`certificates` of [database]"), "{refused}");
+            let refused = tls_config(other, None, "[database]").unwrap_err();
+            assert!(
+                matches!(&refused, TrustError::Unproven { host, table: "[database]" } if host == other),
+                "{refused}"
+            );
         }
     }
 
@@ -121,8 +124,11 @@ mod tests {
             fs::write(&path, text).unwrap();
             // Named certificates are read even if the host needs none.
             for host in ["plant", "localhost"] {
-                let refused = tls_config(host, Some(&path), "[database]").unwrap_err().to_string();
-                assert!(refused.contains("ca.pem: no certificates in PEM"), "{text:?}: {refused}");
+                let refused = tls_config(host, Some(&path), "[database]").unwrap_err();
+                assert!(
+                    matches!(&refused, TrustError::Certificates { path: named, .. } if *named == path),
+                    "{text:?}: {refused}"
+                );
             }
         }
     }

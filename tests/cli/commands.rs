@@ -465,10 +465,8 @@ fn register_warns_of_doubtful_input() {
     };
     assert_eq!(warned("measured.csv", &[]), [""; 0]);
     let told = warned("measured.csv", &["--probe-radius", "3"]);
-    assert!(
-        told.len() == 1 && told[0].contains("a probe radius of about 1.") && told[0].contains("diameter"),
-        "{told:?}"
-    );
+    let radius = ["probe radius", "about 1.", "given 3 mm", "diameter"];
+    assert!(told.len() == 1 && radius.iter().all(|piece| told[0].contains(piece)), "{told:?}");
     let lines: String = measured().iter().map(|p| format!("{:.6},{:.6},{:.6}\n", p[0], p[1], p[2])).collect();
     bench.write("unended.csv", lines.trim_end());
     let told = warned("unended.csv", &[]);
@@ -478,7 +476,8 @@ fn register_warns_of_doubtful_input() {
     );
     bench.write("cut.csv", &lines[..lines.len() - 3]);
     let told = warned("cut.csv", &[]);
-    assert!(told.len() == 1 && told[0].contains("has 4 digits; the lines above have 6"), "{told:?}");
+    let cut = ["cut.csv, line 1500", "4 digits", "6 or more"];
+    assert!(told.len() == 1 && cut.iter().all(|piece| told[0].contains(piece)), "{told:?}");
 }
 
 #[test]
@@ -588,7 +587,9 @@ fn model_reports_form_intervals() {
     let rows = |file: &str| fs::read_to_string(bench.path(file)).unwrap().lines().count();
     assert_eq!(rows("out/here/form.csv"), rows("out/here/deviations.csv"));
     let told = text(&bench.register("nominal.csv", "measured.csv", &["--model"]).stdout);
-    assert!(told.contains("form        RMS ") && told.contains("frame       standard uncertainty "), "{told}");
+    for label in ["form        RMS ", "frame       "] {
+        assert!(told.lines().any(|line| line.starts_with(label)), "{label}: {told}");
+    }
 }
 
 #[test]
@@ -600,21 +601,23 @@ fn plan_reports_time_and_slow_pass() {
     bench.write("slow.toml", shipped.replace(feed, "feed_mm_min = 16.7"));
     let plan = |recipe: &str| text(&bench.run(&["plan", recipe]).stdout);
     let good = plan("good.toml");
-    for words in ["5 passes of ", "5 measurements of at least 13.5 minutes", " h or more"] {
+    for words in ["5 passes", "5 measurements", "at least 13.5 minutes", " h or more"] {
         assert!(good.contains(words), "`{words}` is missing: {good}");
     }
     assert!(!good.contains("warning"), "{good}");
-    assert!(
-        good.contains("mm3 a pass; the loss of the wheel is unknown; set grinding.grinding_ratio to estimate it"),
-        "{good}"
-    );
+    let document =
+        |recipe: &str| -> Value { serde_json::from_slice(&bench.run(&["plan", recipe, "--json"]).stdout).unwrap() };
+    let told = document("good.toml");
+    assert!(told["removed_mm3_a_pass"].is_number() && told["wheel_loss_mm3_a_pass"].is_null(), "{told}");
+    assert!(good.contains("mm3 a pass") && good.contains("grinding.grinding_ratio"), "{good}");
     bench.write("worn.toml", shipped.replace(feed, &format!("{feed}\ngrinding_ratio = 200.0")));
-    let told: Value = serde_json::from_slice(&bench.run(&["plan", "worn.toml", "--json"]).stdout).unwrap();
+    let told = document("worn.toml");
     let [removed, lost] = ["removed_mm3_a_pass", "wheel_loss_mm3_a_pass"].map(|key| told[key].as_f64().unwrap());
     assert!(removed > 0.0 && (removed / lost - 200.0).abs() < 1e-9, "{told}");
     let slow = plan("slow.toml");
-    assert!(slow.contains("warning     a pass takes ") && slow.contains("a shift of 8 h"), "{slow}");
-    assert!(slow.contains("at 16.7 mm/min") && slow.contains("grinding.feed_mm_min"), "{slow}");
+    for piece in ["warning  ", "a pass takes", "a shift of 8 h", "at 16.7 mm/min", "grinding.feed_mm_min"] {
+        assert!(slow.contains(piece), "{piece}: {slow}");
+    }
 }
 
 #[test]

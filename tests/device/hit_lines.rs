@@ -169,23 +169,22 @@ fn with_fault(fault: &Fault) -> Vec<u8> {
 
 #[tokio::test]
 async fn damaged_hit_line_is_touched_again() {
-    // Fault, number of the four targets that are touched anyway, and the words of the message.
+    // Fault, number of the four targets that are touched anyway, and pieces of the message.
     for (fault, touched, why) in [
-        (Fault::Lost(4), 3, "must be a number with 3 digits"),
-        (Fault::Lost(0), 3, "50.000 mm from the nearest target, 7"),
-        (Fault::Garbled(1), 3, "REFUSED line 2 of the measurement, \"1u0.000,200.000,300.000\": value 1 of the line"),
-        (Fault::Merged, 2, "two lines are joined"),
-        (Fault::Stranger("SN 00412".into()), 4, "the line has 1 values instead of 3"),
+        (Fault::Lost(4), 3, ["line 2 ", "150.00,200.000,300.000", "3 digits"]),
+        (Fault::Lost(0), 3, ["line 2 ", "50.000 mm", "nearest target, 7"]),
+        (Fault::Garbled(1), 3, ["REFUSED line 2 ", "1u0.000,200.000,300.000", "value 1 of"]),
+        (Fault::Merged, 2, ["REFUSED line", "instead of 3", "two lines are joined"]),
+        (Fault::Stranger("SN 00412".into()), 4, ["SN 00412", "1 values", "instead of 3"]),
     ] {
         let mut bench = Bench::on_serial(4, |_| {}).await;
         let lines = with_fault(&fault);
         bench.serving.send(&lines).await;
         bench.until(touched, MachineState::Holding).await;
         let notes = bench.notes();
-        assert!(
-            notes.contains(why) && notes.contains("then: regrind confirm still --machine cmm"),
-            "{fault:?}: {notes}"
-        );
+        for piece in why.into_iter().chain(["confirm still", "--machine cmm"]) {
+            assert!(notes.contains(piece), "{fault:?}, {piece}: {notes}");
+        }
         bench.cmm.confirm(OperatorConfirmation::Still).await.unwrap();
         bench.until(touched, MachineState::Held).await;
         bench.cmm.resume().await.unwrap();
@@ -209,7 +208,7 @@ async fn duplicate_hit_line_used_once() {
     bench.serving.send(b"PROBE 1\r\n").await;
     bench.serving.send(&with_fault(&Fault::Twice)).await;
     bench.until(4, MachineState::Execute).await;
-    assert!(bench.notes().contains("1 lines arrived twice and were used once"), "{}", bench.notes());
+    assert!(bench.notes().contains("1 lines arrived twice"), "{}", bench.notes());
     bench.done().await;
 }
 
@@ -289,7 +288,9 @@ async fn hold_stop_abort_need_operator() {
     assert_eq!(bench.cmm.hold().await.unwrap().state, MachineState::Holding);
     bench.serving.send(b"100.000,200.000,300.000\r\n").await;
     bench.until(1, MachineState::Holding).await;
-    assert!(bench.notes().contains("HOLD the machine at its own panel; 1 targets remain: 8"), "{}", bench.notes());
+    for piece in ["HOLD", "1 targets remain: 8"] {
+        assert!(bench.notes().contains(piece), "{piece}: {}", bench.notes());
+    }
     bench.cmm.confirm(OperatorConfirmation::Still).await.unwrap();
     assert_eq!(bench.cmm.stop().await.unwrap().outcome, Outcome::Stopped);
     let mut bench = Bench::on_serial(2, |_| {}).await;

@@ -307,7 +307,7 @@ async fn lost_ownership_names_other_owner() {
     claimed(ModbusSettings { owner: 0xbeef, ..settings(&serving) }).await;
     let taken = first.status().await.unwrap_err();
     assert!(matches!(taken, DeviceError::OwnedByOther { ours: 1, owner: 0xbeef, .. }) && taken.is_link(), "{taken}");
-    assert!(taken.to_string().contains("belongs to another client now (owner 0000beef"), "{taken}");
+    assert!(taken.to_string().contains("0000beef"), "{taken}");
 }
 
 #[tokio::test]
@@ -403,23 +403,22 @@ async fn signals_scaled_and_range_checked() {
     // A bad signal hides no other part of the status.
     let status = cmm.status().await.unwrap();
     let flaw = status.signals[0].problem().unwrap();
-    assert_eq!(flaw, "part_temperature is 20.25 C, limits 15 to 19 C");
+    for piece in ["part_temperature", "20.25 C", "15 to 19 C"] {
+        assert!(flaw.contains(piece), "{flaw}");
+    }
     assert_eq!((status.state, status.temperature_c), (MachineState::Idle, Some(20.25)));
     // A register that does not exist, and one that holds no number.
     let cases = [
-        (
-            60_000,
-            SignalType::I16,
-            0.01,
-            "answered exception 2 (unknown or read-only register) to signal at register 60000: compare",
-        ),
-        (97, SignalType::I16, f64::NAN, "register 97 reads as NaN: compare address, type, scale and word_order"),
+        (60_000, SignalType::I16, 0.01, ["exception 2 ", "signal", "register 60000"]),
+        (97, SignalType::I16, f64::NAN, ["NaN", "word_order", "register 97 "]),
     ];
-    for (address, kind, scale, words) in cases {
+    for (address, kind, scale, pieces) in cases {
         let absent = Signal { address, kind, scale, ..temperature.clone() };
         let mut cmm = connected(ModbusSettings { signals: vec![absent], ..settings(&serving) }).await;
-        let flaw = cmm.status().await.unwrap().signals[0].problem().unwrap();
-        assert!(flaw.starts_with("part_temperature: the machine gives no value: ") && flaw.contains(words), "{flaw}");
+        let status = cmm.status().await.unwrap();
+        let flaw = status.signals[0].problem().unwrap();
+        assert_eq!(status.signals[0].value, None, "{flaw}");
+        assert!(flaw.starts_with("part_temperature: ") && pieces.iter().all(|piece| flaw.contains(piece)), "{flaw}");
     }
 }
 
@@ -476,7 +475,7 @@ async fn connect_refuses_wrong_device() {
     assert!(matches!(e, DeviceError::WrongDevice { address: 1, .. }), "{e}");
     let e = refusal(|image| image.iter_mut().for_each(|word| *word = word.swap_bytes())).await;
     assert!(
-        matches!(&e, DeviceError::WrongLayout { description: how, .. } if how.contains("write word_order = \"badc\"")),
+        matches!(&e, DeviceError::WrongLayout { description: how, .. } if how.contains("word_order = \"badc\"")),
         "{e}"
     );
     let e = refusal(|image| {
@@ -485,7 +484,7 @@ async fn connect_refuses_wrong_device() {
     })
     .await;
     assert!(
-        matches!(&e, DeviceError::WrongLayout { description: how, .. } if how.contains("write word_order = \"dcba\"")),
+        matches!(&e, DeviceError::WrongLayout { description: how, .. } if how.contains("word_order = \"dcba\"")),
         "{e}"
     );
     let e = refusal(|image| image.insert(0, 7)).await;
@@ -504,18 +503,12 @@ async fn connect_refuses_wrong_device() {
     let e = refusal(|image| image[2] = 1).await;
     assert!(matches!(e, DeviceError::WrongVersion { required: 2, found: 1, .. }), "{e}");
     let said = e.to_string();
-    for lacked in [
-        "a heartbeat that names its owner",
-        "refuse a late START",
-        "an ABORT",
-        "remains after CLEAR",
-        "update it to version 2",
-    ] {
+    for lacked in ["heartbeat", "refuse a late START", "an ABORT", "after CLEAR", "to version 2"] {
         assert!(said.contains(lacked), "{said}");
     }
     let e = refusal(|image| image[2] = 3).await;
     assert!(matches!(e, DeviceError::WrongVersion { required: 2, found: 3, .. }), "{e}");
-    assert!(e.to_string().contains("this program is older"), "{e}");
+    assert!(e.to_string().contains("older"), "{e}");
     let e = refusal(|image| image[3] = 2).await;
     assert!(matches!(e, DeviceError::WrongKind { found: MachineKind::Grinder, .. }), "{e}");
     let e = refusal(|image| image[13] = 2).await;

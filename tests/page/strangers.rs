@@ -66,12 +66,9 @@ fn foreign_orders_refused_and_recorded() {
     assert_eq!(post(&visitor, &own(), br#"{"order":"resume","reason":""}"#), 400, "meant for no state");
     assert_eq!(post(&visitor, &own(), &[b' '; 5000]), 413);
     let told = remarks(&shown);
-    for words in [
-        "an order from the origin http://evil.example",
-        "an order without a token of this page, or with a token that was already used",
-        "a request that is not one of the orders that this page can give",
-    ] {
-        assert!(told.iter().any(|remark| remark.contains(words)), "{words}: {told:?}");
+    for pieces in [["origin", "http://evil.example"], ["order", "token"], ["a request", "order"]] {
+        let recorded = told.iter().any(|remark| pieces.iter().all(|piece| remark.contains(piece)));
+        assert!(recorded, "{pieces:?}: {told:?}");
     }
     let now = status(&shown.folder);
     assert_eq!((now["state"].as_str(), now["cycle"].as_u64()), (Some("Execute"), Some(1)), "{now}");
@@ -232,7 +229,8 @@ fn one_screen_has_control_any_can_hold() {
     assert!(one.order(&shown.id, &json!({ "order": "abort", "reason": "" })).1);
     assert_eq!(shown.run.end().0, 3);
     let told = remarks(&shown);
-    assert!(told.iter().any(|remark| remark.contains("another screen of the page took control")), "{told:?}");
+    let pieces = ["another screen", "took control"];
+    assert!(told.iter().any(|remark| pieces.iter().all(|piece| remark.contains(piece))), "{told:?}");
     let reader = regrind::journal::Reader::open(&shown.folder).unwrap();
     let stations: Vec<String> = reader.records(1).map(|record| record.unwrap().station).collect();
     assert!(stations.iter().any(|station| station.starts_with("page, screen ")), "{stations:?}");

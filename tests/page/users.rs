@@ -137,8 +137,13 @@ fn roles_limit_orders_and_are_recorded() {
     }
     let reader = regrind::journal::Reader::open(&shown.folder).unwrap();
     let operators: Vec<String> = reader.records(1).map(|record| record.unwrap().actor).collect();
-    for name in ["quality (quality), by a program of", "operator (operator), by", "engineer (engineer), by"] {
-        assert!(operators.iter().any(|operator| operator.contains(name)), "{name}: {operators:?}");
+    for pieces in [
+        ["quality (quality), by", "by a program of"],
+        ["operator (operator)", "(operator), by"],
+        ["engineer (engineer)", "(engineer), by"],
+    ] {
+        let named = operators.iter().any(|operator| pieces.iter().all(|piece| operator.contains(piece)));
+        assert!(named, "{pieces:?}: {operators:?}");
     }
 }
 
@@ -173,10 +178,13 @@ fn wrong_passwords_are_throttled() {
     assert!(wrong.count() > 0, "{remarks:?}");
     shown.page.interrupt();
     let (_, told) = shown.page.end();
-    let came_in = told.lines().filter(|line| line.starts_with("page: engineer (engineer) signed in at the page, from"));
-    assert_eq!(came_in.count(), 1, "{told}");
-    assert!(told.contains("page: refused a sign-in with a wrong name or password, as operator from"), "{told}");
-    assert!(told.contains("page: too many requests were refused in this minute"), "{told}");
+    let lines_with = |pieces: &[&str]| {
+        let lines = told.lines().filter(|line| line.starts_with("page: "));
+        lines.filter(|line| pieces.iter().all(|piece| line.contains(piece))).count()
+    };
+    assert_eq!(lines_with(&["engineer (engineer)", "signed in"]), 1, "{told}");
+    assert!(lines_with(&["refused", "password", "operator"]) > 0, "{told}");
+    assert!(lines_with(&["too many requests"]) > 0, "{told}");
 }
 
 #[test]

@@ -131,7 +131,7 @@ fn audit_verifies_sound_record() {
     let (home, folder) = recorded(true);
     let words = printed(home.path(), &["audit", "verify"], 0);
     assert!(words.starts_with("SIMULATION  runs/mirror-1\n"), "{words}");
-    assert!(words.contains("14 records in an unbroken chain, 3 files unchanged"), "{words}");
+    assert!(words.contains("14 records") && words.contains("3 files"), "{words}");
     let value: Value =
         serde_json::from_str(&printed(home.path(), &["audit", "verify", folder.to_str().unwrap(), "--json"], 0))
             .unwrap();
@@ -151,7 +151,9 @@ fn audit_names_broken_record() {
     let (home, folder) = recorded(true);
     fs::write(folder.join("cycle-2/measured.csv"), "1,2,4\n").unwrap();
     let error = refused(home.path(), &["audit", "verify"], 1);
-    assert!(error.contains("broken at record 12: the file cycle-2/measured.csv was changed"), "{error}");
+    for piece in ["broken at record 12", "cycle-2/measured.csv", "changed"] {
+        assert!(error.contains(piece), "{error}");
+    }
     let value: Value = serde_json::from_str(&printed(home.path(), &["audit", "verify", "--json"], 1)).unwrap();
     assert_eq!((&value["sound"], &value["record"]), (&json!(false), &json!(12)));
 
@@ -192,8 +194,7 @@ fn audit_lists_unrecorded_files() {
     let html = fs::read_to_string(folder.join("report.html")).unwrap();
     fs::write(folder.join("report.html"), html.replace("0.812", "0.212")).unwrap();
     let words = printed(home.path(), &["audit", "verify"], 0);
-    assert!(words.contains("not on record: cycle-2/more.csv"), "{words}");
-    assert!(words.contains("report.html differs from the report that the record gives"), "{words}");
+    assert!(words.contains("cycle-2/more.csv") && words.contains("report.html differs"), "{words}");
 }
 
 #[test]
@@ -218,21 +219,23 @@ fn audit_show_prints_marked_table() {
     let (home, _) = recorded(true);
     let shown = printed(home.path(), &["audit", "show"], 0);
     assert!(shown.starts_with("SIMULATION  runs/mirror-1; Mirror <A> & B\n"), "{shown}");
-    let said = [
-        "begin         -  SIMULATION  run mirror-1, Mirror <A> & B, recipes/mirror.toml",
-        "artefact      -  recipe.toml, 6 bytes, sha256 ",
-        "event         1  start",
-        "grinder: connected, a simulation, idle",
-        "grinder: fault, 5, drive [2J too warm",
-        "registered, PV 4.20 µm, RMS 0.812 µm, 812 points, 3 outliers; the part is warm",
-        "intent        2  grinder: start",
-        "ALARM A machine is in fault: grinder. The run is aborted.",
-        "judged, accept: in tolerance",
-        "pass: path 12.5 mm",
-        "end           2  ACCEPTED: in tolerance",
+    // The pieces of one row each. The texts of fault, alarm and warning are those of the events.
+    let said: [&[&str]; 11] = [
+        &["begin         -", "SIMULATION", "run mirror-1", "Mirror <A> & B", "recipes/mirror.toml"],
+        &["artefact      -", "recipe.toml, 6 bytes", "sha256 "],
+        &["event         1  start"],
+        &["grinder: connected", "simulation", "idle"],
+        &["grinder: fault, 5", "drive [2J too warm"],
+        &["PV 4.20 µm", "RMS 0.812 µm", "812 points", "3 outliers", "the part is warm"],
+        &["intent        2", "grinder: start"],
+        &["ALARM ", "fault: grinder", "aborted"],
+        &["judged", "accept: in tolerance"],
+        &["pass: path 12.5 mm"],
+        &["end           2", "ACCEPTED: in tolerance"],
     ];
-    for words in said {
-        assert!(shown.contains(words), "{words}\n{shown}");
+    for pieces in said {
+        let is_shown = shown.lines().any(|line| pieces.iter().all(|piece| line.contains(piece)));
+        assert!(is_shown, "{pieces:?}\n{shown}");
     }
     assert!(!shown.contains('\u{1b}'), "a machine's words control no terminal");
     let rows =
@@ -383,7 +386,8 @@ fn signed_run_verifies_with_public_key() {
     assert_eq!((&told["sound"], &told["record"]), (&json!(false), &Value::Null));
     printed(home.path(), &["audit", "verify", "--key", &other, "--key", "kept"], 0);
     let shown = printed(home.path(), &["audit", "show", "--kind", "seal"], 0);
-    assert!(shown.contains("the records up to record 1 are sealed with key "), "{shown}");
+    let key = &public.to_string()[..12];
+    assert!(shown.lines().any(|line| line.contains("to record 1 ") && line.contains(key)), "{shown}");
     for wrong in ["", "abc", "absent", "small.toml"] {
         let error = refused(home.path(), &["audit", "verify", "--key", wrong], 2);
         assert!(error.contains("regrind audit key"), "{wrong}: {error}");
@@ -431,16 +435,17 @@ fn audit_detects_unsigned_end() {
         content: Value::Null,
     };
     let journal = Journal::create_with(&folder, header, Some(AuditKey::new())).unwrap();
-    assert!(printed(home.path(), &["audit", "verify"], 4).contains("signed      up to record 1 of 2"));
+    assert!(printed(home.path(), &["audit", "verify"], 4).contains("record 1 of 2"));
     journal.close(0, 0, json!("stopped")).unwrap();
     printed(home.path(), &["audit", "verify"], 0);
     let database = rusqlite::Connection::open(folder.join("journal.sqlite")).unwrap();
     database.execute_batch("DROP TRIGGER record_is_not_deleted; DELETE FROM record WHERE seq = 4").unwrap();
     drop(database);
     assert!(verify(&folder).unwrap().lacks_last_seal());
-    assert!(refused(home.path(), &["audit", "verify"], 1).contains("the end of the record is not signed"));
+    let error = refused(home.path(), &["audit", "verify"], 1);
+    assert!(error.contains("end of the record") && error.contains("not signed"), "{error}");
     let (home, _) = recorded(false);
-    assert!(printed(home.path(), &["audit", "verify"], 0).contains("signed      no: the run had no key"));
+    assert!(printed(home.path(), &["audit", "verify"], 0).contains("signed      no"));
 }
 
 #[test]
@@ -468,7 +473,7 @@ fn report_is_self_contained() {
     for words in said {
         assert!(all.contains(words), "{words}\n{all}");
     }
-    assert!(all.contains("PV of the map 3.00 \u{b5}m") && all.contains("3 nodes"), "{all}");
+    assert!(all.contains("3.00 \u{b5}m") && all.contains("3 nodes"), "{all}");
     let image = document.descendants().find(|node| node.has_tag_name("image")).unwrap();
     assert!(image.attribute("href").unwrap().starts_with("data:image/png;base64,iVBORw"));
     assert!(!html.contains("http"), "nothing is fetched");
@@ -496,7 +501,7 @@ fn audit_reports_open_run() {
     let mut journal = Journal::create(home.path().join("runs/r"), header).unwrap();
     journal.append(Entry::new(RecordKind::Note, 0, 0, json!("a word"))).unwrap();
     let proven = printed(home.path(), &["audit", "verify"], 4);
-    assert!(proven.contains("not closed: nothing was cut off up to record 1"), "{proven}");
+    assert!(proven.contains("not closed") && proven.contains("up to record 1"), "{proven}");
     assert!(printed(home.path(), &["audit", "show"], 0).ends_with("-  a word\n"));
 }
 
@@ -546,7 +551,7 @@ fn state_table_and_picture_are_current() {
     assert!(idle.contains("  start                          -> Starting"), "{idle}");
     assert!(!idle.contains("refuse"), "{idle}");
     let unknown = refused(home.path(), &["states", "--state", "x"], 2);
-    assert!(unknown.contains("give one of Idle, Starting, Execute"), "{unknown}");
+    assert!(unknown.contains("Idle, Starting, Execute"), "{unknown}");
 
     printed(home.path(), &["states", "--svg", "states.svg"], 0);
     let drawn = fs::read_to_string(home.path().join("states.svg")).unwrap();

@@ -167,7 +167,8 @@ fn disk_full_starts_no_cycle() {
     let disk = SmallDisk::at(home.path().join("small"), 400);
     let arguments = ["run", &recipe, "--cell", &sim_cell(), "--runs", "small"];
     let (code, _, errors) = in_time(&arguments, home.path());
-    assert!(code == 2 && errors.contains("small: the disk has 0 MB free") && errors.contains("--runs"), "{errors}");
+    let full = ["small: ", "0 MB free", "--runs"];
+    assert!(code == 2 && full.iter().all(|piece| errors.contains(piece)), "{errors}");
     drop(disk);
     // A disk that fills up while the first part is ground holds the cell before the measurement. The record still fits.
     let disk = SmallDisk::at(home.path().join("other"), 40_000);
@@ -248,7 +249,7 @@ fn simulate_refuses_file_at_device_link() {
     fs::write(home.path().join("grinder.tty"), "mine").unwrap();
     let (code, _, errors) = in_time(&["simulate", &recipe(home.path(), 1e4), "--cell", "cell.toml"], home.path());
     assert!(code == 2 || code == 3, "{code} {errors}");
-    assert!(errors.contains("grinder.tty") && errors.contains("remove the file at this path"), "{errors}");
+    assert!(errors.contains("grinder.tty") && errors.contains("remove the file"), "{errors}");
     assert_eq!(fs::read_to_string(home.path().join("grinder.tty")).unwrap(), "mine");
     assert!(fs::symlink_metadata(home.path().join("cmm.tty")).is_err(), "what was linked before is taken back");
 }
@@ -313,7 +314,7 @@ fn recipe_beyond_cell_limits_refused() {
             "config/modbus-tcp.toml",
             "[grinder.limits]",
             "[grinder.travel]\nmin_mm = [-10.0, -500.0, -400.0]\nmax_mm = [10.0, 500.0, 400.0]\n\n[grinder.limits]",
-            "outside the travel of -10 to 10 mm",
+            "-10 to 10 mm",
         ),
     ];
     for (name, file, from, to, named) in cells {
@@ -340,7 +341,9 @@ fn pass_beyond_travel_is_not_started() {
     fs::write(home.path().join("narrow.toml"), changed("config/sim.toml", &[("[grinder.limits]", narrow)])).unwrap();
     let (code, said, errors) = in_time(&["run", "first.toml", "--cell", "narrow.toml"], home.path());
     assert_eq!(code, 1, "{said}\n{errors}");
-    assert!(said.contains("ALARM") && said.contains("outside the travel of -10 to 10 mm"), "{said}");
+    for piece in ["ALARM", "travel", "-10 to 10 mm"] {
+        assert!(said.contains(piece), "{piece}: {said}");
+    }
     let cycle = only_run(&home.path().join("runs")).join("cycle-1");
     assert!(cycle.join("error_map.csv").is_file());
     for file in ["correction.csv", "toolpath.ngc", "toolpath_z.csv"] {
@@ -414,12 +417,7 @@ fn ctrl_c_holds_then_aborts() {
         assert!(began.elapsed() < BOUNDED, "it does not come to hold");
     }
     let (_, said, _) = run(&["status", folder.to_str().unwrap()], home.path());
-    for part in [
-        "SIMULATION  Held (Grind, Run), cycle 1 of at most ",
-        "grinding, ",
-        "next     to continue: regrind resume",
-        ", run ",
-    ] {
+    for part in ["SIMULATION", "Held (Grind, Run)", "cycle 1 of", "grinding, ", "regrind resume", ", run "] {
         assert!(said.contains(part), "{part:?}: {said}");
     }
     let (_, said, _) = run(&["status", folder.to_str().unwrap(), "--json"], home.path());

@@ -57,7 +57,7 @@ fn wrong_devices_detected_before_write() {
     let (other_order, exchanged) = (Setup { other_word_order: true, ..usual() }, Setup { exchanged: true, ..usual() });
     let order_words = &["word order", "othing was written", "word_order in the cell file"];
     let older = &["version 1 of the register map", "lacks a heartbeat that names its owner", "update it to version 2"];
-    let newer = &["version 3 of the register map", "this program is older"];
+    let newer = &["version 3 of the register map", "this version of Regrind is older"];
     let cases: [(&str, Setup, AlarmId, &[&str]); 4] = [
         ("an older map", Setup { version: 1, ..usual() }, AlarmId::WrongDevice, older),
         ("a newer map", Setup { version: 3, ..usual() }, AlarmId::WrongDevice, newer),

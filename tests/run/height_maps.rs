@@ -16,7 +16,7 @@ use regrind::device::file_exchange::{CmmExchange, CmmFolders, Exchange, MeasureO
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
 use regrind::drive::{BlockingExecutor, CycleRow, Drive, JournalSink, Notice, RunInputs};
 use regrind::formats::result::{Content, Coordinates as Said};
-use regrind::formats::{self, HeightMap, MapRecord, X3pFile, read_measured, read_x3p, write_x3p};
+use regrind::formats::{self, FormatError, HeightMap, MapRecord, X3pFile, read_measured, read_x3p, write_x3p};
 use regrind::geometry::{Grid, Pose};
 use regrind::journal::Journal;
 use regrind::recipe::Recipe;
@@ -372,8 +372,8 @@ fn height_map_formats_give_contact_points() {
         for (found, expected) in points.iter().zip(map.points()) {
             assert!((found - expected).norm() < 1e-7, "{}: {found} not {expected}", path.display());
         }
-        let told = formats::read_nominal(&path).unwrap_err().to_string();
-        assert!(told.contains("give the map as the measurement"), "{told}");
+        let told = formats::read_nominal(&path).unwrap_err();
+        assert!(matches!(told, FormatError::WrongKind { .. }), "{told}");
         let (taken, said) = exchanged(&path, Content::default());
         let taken = taken.unwrap_or_else(|| panic!("{said:#?}"));
         assert_eq!((taken.points.len(), taken.coordinates), (19, Coordinates::Contacts));
@@ -417,8 +417,8 @@ fn height_map_without_scale_refused() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("map.dat");
     fs::write(&path, metropro([5, 4], 0.0, &[Some(1e-4); 20])).unwrap();
-    let told = read_measured(&path).unwrap_err().to_string();
-    assert!(told.contains("no lateral scale") && told.contains("calibrate the lateral resolution"), "{told}");
+    let told = read_measured(&path).unwrap_err();
+    assert!(matches!(told, FormatError::NoLateralScale { .. }), "{told}");
     let (taken, said) = exchanged(&path, Content::default());
     assert!(taken.is_none() && said.join("\n").contains("no lateral scale"), "{said:?}");
 }

@@ -12,7 +12,9 @@ fn part_made_over_ippdme() {
     let typed = ["run", recipe.to_str().unwrap(), "--cell", cell.to_str().unwrap(), "--runs", "runs"];
     let (code, told, error) = run(&typed, home.path());
     assert_eq!(code, 0, "{told}\n{error}");
-    assert!(told.contains("the travel between targets is") && told.contains("ACCEPTED"), "{told}");
+    for piece in ["travel between targets", "ACCEPTED"] {
+        assert!(told.contains(piece), "{piece}: {told}");
+    }
     let (code, told, _) = run(&["audit", "verify"], home.path());
     assert_eq!(code, 0, "{told}");
 }
@@ -37,6 +39,8 @@ fn doctor_inspects_ippdme_server() {
     for _ in 0..2 {
         let (code, told, error) = run(&["doctor", cell.to_str().unwrap()], home.path());
         assert_eq!(code, 0, "{told}\n{error}");
-        assert!(told.contains("CartCMM_Simulated, I++ DME 1.4 is IDLE"), "{told}");
+        for piece in ["CartCMM_Simulated", "I++ DME 1.4 is IDLE"] {
+            assert!(told.contains(piece), "{piece}: {told}");
+        }
     }
 }

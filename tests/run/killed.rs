@@ -289,5 +289,5 @@ async fn resume_refuses_changed_run() {
     running.end();
     let own = only_run(&home.join("own"));
     let (code, _, said) = resumed(&[own.to_str().unwrap()]);
-    assert!(code == 2 && said.contains("ended with the program of this run"), "{said}");
+    assert!(code == 2 && said.contains("simulated machines"), "{said}");
 }

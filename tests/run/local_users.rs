@@ -144,7 +144,7 @@ fn other_user_cannot_interfere() {
             another_user(&format!("rm -f {0}; truncate -s 9999 {0}", lock.display()));
         }
         let (code, _, errors) = run(&cell.arguments(), home);
-        assert!(code == 3 && errors.contains("another run uses this machine"), "{code} {errors}");
+        assert!(code == 3 && errors.contains("uses this machine"), "{code} {errors}");
         let (code, errors) = running.end();
         assert_eq!(code, 0, "{}\n{errors}", running.output_lines.join("\n"));
         let states = records_with(&folder, "command");

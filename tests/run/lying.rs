@@ -194,7 +194,7 @@ async fn progress_while_held_aborts() {
     assert_eq!(alarm(&mut notices).await.0, AlarmId::MachineHeldItself);
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::HoldNotConfirmed, "{what}");
-    assert!(what.contains("the machine reports HELD, but the progress of the job has risen"), "{what}");
+    assert!(what.contains("HELD") && what.contains("progress"), "{what}");
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { .. }), "{ending:?}");
 }
@@ -214,7 +214,7 @@ async fn stop_not_executed_aborts() {
     assert!(order(&folder, Request::Stop { reason: "enough".into() }).await.0.taken);
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::StopNotConfirmed, "{what}");
-    assert!(what.contains("the machine accepted STOP, but is still in EXECUTE"), "{what}");
+    assert!(what.contains("STOP") && what.contains("EXECUTE"), "{what}");
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { .. }), "{ending:?}");
 }
@@ -232,7 +232,7 @@ async fn complete_at_40_percent_refused() {
     let running = tokio::spawn(drive.run());
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::PassRecord, "{what}");
-    assert!(what.contains("the progress is only 400 of 1000"), "{what}");
+    assert!(what.contains("400 of 1000"), "{what}");
     until(&folder, |words| words.starts_with("Held (Transfer)")).await;
     order(&folder, Request::Abort { reason: "seen enough".into() }).await;
     running.await.unwrap();
@@ -247,8 +247,8 @@ async fn impossible_measurement_refused() {
     let fates: Vec<(Fate, AlarmId, &str)> = vec![
         (Box::new(|of| of.temperature_c = Some(-327.0)), AlarmId::BrokenResult, "the temperature is -327"),
         (Box::new(|of| of.duration_s = Some(-5.0)), AlarmId::BrokenResult, "the duration is -5 s"),
-        (Box::new(|of| of.probe_radius_mm = Some(0.0)), AlarmId::BrokenResult, "the probe's radius is 0 mm"),
-        (Box::new(|of| of.points[3].quality = 101), AlarmId::BrokenResult, "the quality of a point is 101"),
+        (Box::new(|of| of.probe_radius_mm = Some(0.0)), AlarmId::BrokenResult, "radius is 0 mm"),
+        (Box::new(|of| of.points[3].quality = 101), AlarmId::BrokenResult, "of a point is 101"),
         (Box::new(|of| of.points[40].position_mm[2] = 1e30), AlarmId::BrokenResult, "a coordinate is 1000000"),
     ];
     let told: Vec<_> = fates.iter().map(|(_, id, words)| (*id, *words)).collect();
@@ -271,7 +271,7 @@ async fn impossible_measurement_refused() {
     }
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::ForeignResult, "{what}");
-    assert!(what.contains("all points are identical to the points of cycle 6"), "{what}");
+    assert!(what.contains("identical") && what.contains("cycle 6"), "{what}");
     order(&folder, Request::Abort { reason: "seen enough".into() }).await;
     running.await.unwrap();
 }

@@ -133,7 +133,9 @@ impl Person {
 /// rest.
 fn hold_and_go_on(person: &Person, program: &mut Running) {
     person.does("hold");
-    let still = program.line("prompt to hold", |line| line.contains("then: regrind confirm still"));
+    let still = program.line("prompt to hold", |line| {
+        line.split_once("then: regrind ").is_some_and(|(_, command)| command.starts_with("confirm still"))
+    });
     let state = || person.types("status").1;
     // The status output also shows which confirmation the cell waits for.
     assert!(state().starts_with("Holding") && state().contains("regrind confirm still"), "{}", state());
@@ -201,7 +203,7 @@ fn manual_part_with_recorded_steps() {
             "confirm started" => {
                 // A step that has not started cannot end, and a confirmation that names another map is refused.
                 let (code, told) = person.types("confirm done");
-                assert!(code == 3 && told.contains("confirm first that the pass has begun"), "{told}");
+                assert!(code == 3 && told.contains("regrind confirm started"), "{told}");
                 let (code, told) = person.types("confirm started --map 0123456789abcdef");
                 assert!(code == 3 && told.contains("the confirmation names"), "{told}");
                 let ngc = file(": with ", " (map");

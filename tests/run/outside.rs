@@ -123,13 +123,18 @@ fn order_help_has_example() {
 
 #[test]
 fn sigterm_and_hangup_stop_in_order() {
-    for (signal, reason) in [("TERM", "SIGTERM"), ("HUP", "SIGHUP, the terminal was closed")] {
+    for signal in ["TERM", "HUP"] {
         let home = tempfile::tempdir().unwrap();
         let (mut running, folder) = grinding(home.path(), |arguments| heeding_hangup(arguments, home.path()));
         running.signal(signal);
         let (code, errors) = running.end();
         assert!(code == 1 && !errors.contains("error"), "{signal}: {code} {errors}");
-        assert_eq!(orders(&folder), [("stop".to_owned(), reason.to_owned())]);
+        let orders = orders(&folder);
+        let name = format!("SIG{signal}");
+        assert!(
+            matches!(&orders[..], [(order, reason)] if order == "stop" && reason.starts_with(&name)),
+            "{signal}: {orders:?}"
+        );
         let verified = verify(&folder).unwrap();
         assert!(verified.closed, "{signal}: {verified:?}");
         assert!(folder.join("result.json").exists() && folder.join("report.html").exists(), "{signal}");
@@ -225,7 +230,7 @@ fn second_run_refused_for_same_machines() {
     first.line("grinding", |line| line.contains("grinding"));
     let (code, _, errors) = run(&begin, home.path());
     let name = folder.file_name().unwrap().to_str().unwrap();
-    assert!(code == 3 && errors.contains("another run uses this machine") && errors.contains(name), "{code} {errors}");
+    assert!(code == 3 && errors.contains("uses this machine") && errors.contains(name), "{code} {errors}");
     // The first run still decides when it ends.
     let (code, _, errors) = run(&["abort"], home.path());
     assert_eq!(code, 0, "{errors}");
@@ -280,7 +285,7 @@ fn init_files_valid_for_every_machine() {
 fn init_without_folder_refused() {
     let home = tempfile::tempdir().unwrap();
     let (code, _, errors) = run(&["init"], home.path());
-    assert!(code == 2 && errors.contains("the folder to create is missing"), "{errors}");
+    assert!(code == 2 && ["folder", "missing"].iter().all(|piece| errors.contains(piece)), "{errors}");
     assert_eq!(fs::read_dir(home.path()).unwrap().count(), 0);
 }
 
@@ -310,11 +315,10 @@ fn doctor_finds_missing_exchange_folders() {
     let shop = home.path().join("shop");
     let (code, said, _) = run(&["doctor", "cell.toml"], &shop);
     assert_eq!(code, 1, "{said}");
-    assert!(
-        said.matches("OBSTACLE").count() == 2
-            && said.contains("does not exist; create this folder where the measuring machine can use it"),
-        "{said}"
-    );
+    assert_eq!(said.matches("OBSTACLE").count(), 2, "{said}");
+    for piece in ["folder", "does not exist", "measuring machine"] {
+        assert!(said.contains(piece), "{piece}: {said}");
+    }
     for folder in ["cmm/in", "cmm/out", "grinder/in", "grinder/out"] {
         fs::create_dir_all(shop.join("exchange").join(folder)).unwrap();
     }
@@ -327,7 +331,8 @@ fn run_serves_its_page() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 1e5).display().to_string();
     let (code, said, errors) = run(&["run", &recipe, "--cell", "sim", "--serve", "127.0.0.1:0"], home.path());
-    assert!(code == 0 && said.contains("page     http://127.0.0.1:"), "{said}{errors}");
+    let page = said.lines().any(|line| line.starts_with("page ") && line.contains("http://127.0.0.1:"));
+    assert!(code == 0 && page, "{said}{errors}");
 }
 
 #[test]
@@ -335,8 +340,10 @@ fn doctor_lists_obstacles() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 1e4).display().to_string();
     let (code, said, errors) = run(&["doctor", "--recipe", &recipe], home.path());
-    assert!(code == 0 && said.contains("simulated within the program") && !said.contains("OBSTACLE"), "{said}{errors}");
-    assert!(said.contains("sphere is clear of the part") && said.contains("records are not signed"), "{said}");
+    assert!(code == 0 && !said.contains("OBSTACLE"), "{said}{errors}");
+    for piece in ["simulated within", "reference sphere", "not signed"] {
+        assert!(said.contains(piece), "{piece}: {said}");
+    }
     assert!(!home.path().join("runs").exists(), "it leaves nothing behind");
 
     let cell = home.path().join("cell.toml");

@@ -64,9 +64,10 @@ fn wheel_radius_compensated_in_run() {
             let [off, expanded, taken] = ["off", "expanded", "taken"].map(|key| radius[key].as_f64().unwrap());
             assert!((off - 400.0).abs() <= expanded && taken > 0.8 * off, "{radius}");
             let correction = read("cycle-1/correction.csv");
-            assert!(correction.contains("# parameter: wheel radius: off by "), "{}", &correction[..900]);
-            assert!(read("cycle-1/toolpath.ngc").contains("parameter: wheel radius: off by "));
-            assert!(said.contains("error that remains for the correction map: "), "{said}");
+            assert!(correction.contains("# parameter: wheel"), "{}", &correction[..900]);
+            assert!(read("cycle-1/toolpath.ngc").contains("parameter: wheel radius"));
+            let is_rest = |line: &str| ["cycle ", "correction map", "µm RMS"].iter().all(|piece| line.contains(piece));
+            assert!(said.lines().any(is_rest), "{said}");
         }
         passes
     });

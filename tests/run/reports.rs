@@ -146,15 +146,16 @@ fn report_of_accepted_run_matches_result() {
 fn means_registration_and_signatures(page: &Page, folder: &Path, cycles: usize) {
     let cells = |table: &str| page.rows(table).into_iter().map(|row| row.join("|")).collect::<Vec<_>>();
     let means = cells("means");
-    assert!(means[0].starts_with("SIMULATED CMM 1, measuring machine at 127.0.0.1:"), "{means:?}");
-    assert!(means[1].starts_with("SIMULATED GRINDER 1, grinder at 127.0.0.1:"), "{means:?}");
-    assert!(means[2].starts_with("radius 12.5000 mm, as the grinder reported"), "{means:?}");
+    for (row, name) in means.iter().zip(["SIMULATED CMM 1, ", "SIMULATED GRINDER 1, "]) {
+        assert!(row.starts_with(name) && row.contains("127.0.0.1:"), "{means:?}");
+    }
+    assert!(means[2].starts_with("radius 12.5000 mm") && means[2].contains("grinder"), "{means:?}");
     let found = json_in(folder, &format!("cycle-{cycles}/registration.json"));
-    let radius = format!(
-        "radius {:.5} mm; the radius measured on the reference sphere in cycle {cycles} differs by ",
-        found["probe_radius_mm"].as_f64().unwrap()
-    );
+    let radius = format!("radius {:.5} mm", found["probe_radius_mm"].as_f64().unwrap());
     assert!(means[3].starts_with(&radius), "{means:?}");
+    for piece in ["reference sphere", &format!("in cycle {cycles}")] {
+        assert!(means[3].contains(piece), "{piece}: {means:?}");
+    }
     let registration = cells("registration");
     let used = format!("{} of {} points used", found["used"], found["points"]);
     assert!(registration[0].contains("converged in ") && registration[0].contains(&used), "{registration:?}");
@@ -170,7 +171,7 @@ fn maps_are_drawn(page: &Page, cycles: usize) {
         page.texts(|node| node.has_tag_name("figure")).into_iter().partition(|figure| !figure.contains("scale"));
     assert_eq!((others.len(), figures.len()), (2, 3));
     assert!(others[0].contains("Convergence") && others[0].contains("limit of RMS"), "{others:?}");
-    assert!(others[1].contains("nodes of the filtered map") && others[1].contains("SN 12"), "{others:?}");
+    assert!(others[1].contains("filtered map") && others[1].contains("SN 12"), "{others:?}");
     for (figure, cycle) in figures.iter().zip([1, cycles, cycles]) {
         for words in [
             &format!("Cycle {cycle}, 20"),
@@ -268,7 +269,9 @@ fn report_of_stopped_run() {
     let mut told = records_with(&folder, "done").into_iter().filter(|event| event["event"] == "progressed");
     let last = told.rfind(|event| event["device"] == "grinder").expect("a pass that moves tells how far it is");
     let share = 100.0 * last["done"].as_f64().unwrap() / last["total"].as_f64().unwrap();
-    assert!(page.says(&format!("The pass of cycle 1 was stopped: {share:.0} % of the path was ground")), "{last}");
+    for piece in ["cycle 1 was stopped", &format!(" {share:.0} % of the path")] {
+        assert!(page.says(piece), "{piece}: {last}");
+    }
 }
 
 #[test]
@@ -378,19 +381,25 @@ fn report_lists_alarms_with_times() {
     let alarms = page.rows("alarms");
     let [grinder, cmm, fault] = alarms.as_slice() else { panic!("{alarms:?}") };
     for (row, words) in [(grinder, "lost: grinder."), (cmm, "lost: CMM."), (fault, "in fault: grinder.")] {
-        assert!(row[2].contains(words) && row[2].contains("The cell is held. Look at it. Resume."), "{row:?}");
+        for piece in [words, "The cell is held.", "Look at it.", "Resume."] {
+            assert!(row[2].contains(piece), "{piece}: {row:?}");
+        }
     }
     let times: Vec<String> =
         Reader::open(&folder).unwrap().records(1).map(|r| r.unwrap().utc[11..19].to_owned()).collect();
     assert!(grinder[0].contains(&times[2]) && grinder[1].contains(&times[3]), "{grinder:?} {times:?}");
     assert!(cmm[1].contains(&times[6]), "{cmm:?} {times:?}");
     assert_eq!(fault[1], "not withdrawn");
-    let standstill = "ABORTED, but at least one machine has not confirmed its standstill: check the machines.";
-    assert!(page.verdict().0.starts_with(&format!("{standstill} Reason of the abort: smoke")));
+    let (verdict, is_good) = page.verdict();
+    assert!(verdict.starts_with("ABORTED") && !is_good, "{verdict}");
+    for piece in ["standstill", "smoke"] {
+        assert!(verdict.contains(piece), "{piece}: {verdict}");
+    }
     let shown = shown(&folder);
-    let said = |words: &str| shown.iter().any(|(_, row)| row.contains(words));
-    assert!(said("ALARM A machine is in fault: grinder. The cell is held."), "{shown:#?}");
-    assert!(said("alarm withdrawn: link lost"), "{shown:#?}");
+    for pieces in [&["ALARM ", "in fault: grinder.", "The cell is held."][..], &["alarm withdrawn", "link lost"]] {
+        let said = shown.iter().any(|(_, row)| pieces.iter().all(|piece| row.contains(piece)));
+        assert!(said, "{pieces:?}: {shown:#?}");
+    }
 }
 
 #[test]
@@ -410,8 +419,8 @@ fn report_of_failed_and_amended_cycles() {
     let page = Page::read(&folder);
     let rows: Vec<String> = page.cycles().iter().map(|row| row.join("|")).collect();
     assert_eq!(rows.len(), 3, "{rows:?}");
-    assert!(rows[0].contains("12 % found, 95 % are needed") && rows[2].contains("it did not converge"), "{rows:?}");
-    let last = ["budget spent", "no material is left", "first judged, continue: not yet in tolerance"];
+    assert!(rows[0].contains("12 % found, 95 %") && rows[2].contains("it did not converge"), "{rows:?}");
+    let last = ["budget spent", "no material is left", "first judged, continue", "not yet in tolerance"];
     assert!(last.iter().all(|words| rows[1].contains(words)), "{rows:?}");
     // The end is on record even if the command to finish is not.
     assert_eq!(page.verdict(), ("NOT ACCEPTED: no material is left".into(), false));
@@ -453,19 +462,23 @@ fn report_shows_no_raw_record() {
     for (kind, words) in &shown {
         assert!(!words.contains('{') && !words.contains("  null"), "a {kind} is raw: {words}");
     }
-    let said = |words: &str| assert!(shown.iter().any(|(_, row)| row.contains(words)), "{words}: {shown:#?}");
-    said(
-        "pass: path 1250 mm, 12.5 mm³ removed, largest depth 20.0 µm, 25 % of the path in air, wheel radius 12.5000 mm, 21.0 °C, 75 s",
-    );
-    said("812 points fetched in 0.50 s, 0.616 ms per point, probe centres");
-    said("CMM: waits for a file; left alone: old.csv");
-    said("grinder: done, map 3fa9c210");
-    said("grinder: order CLEAR to recover the machine; state before the order: FAULTED");
-    said("answered: IDLE");
+    let lines: [&[&str]; 6] = [
+        &["pass: path 1250 mm", "12.5 mm³", "20.0 µm", "25 %", "12.5000 mm", "21.0 °C", "75 s"],
+        &["812 points", "0.50 s", "0.616 ms", "centres"],
+        &["CMM: waits for a file", "left alone: old.csv"],
+        &["grinder: done", "map 3fa9c210"],
+        &["grinder: order CLEAR", "FAULTED"],
+        &["answered: IDLE"],
+    ];
+    for pieces in lines {
+        let said = shown.iter().any(|(_, row)| pieces.iter().all(|piece| row.contains(piece)));
+        assert!(said, "{pieces:?}: {shown:#?}");
+    }
     // A person's confirmation about a machine is an order like any other. The report shows why an order was refused.
     let orders: Vec<String> = Page::read(&folder).rows("orders").iter().map(|row| row.join("|")).collect();
-    for words in ["grinder: done, map 3fa9c210", "grinder: order CLEAR to recover the machine"] {
-        assert!(orders.iter().any(|row| row.contains(words)), "{words}: {orders:#?}");
+    for pieces in [["grinder: done", "map 3fa9c210"], ["grinder: ", "order CLEAR"]] {
+        let listed = orders.iter().any(|row| pieces.iter().all(|piece| row.contains(piece)));
+        assert!(listed, "{pieces:?}: {orders:#?}");
     }
 }
 

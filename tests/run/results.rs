@@ -105,7 +105,9 @@ fn results_refused_without_measurement() {
     let (home, folder) = written.ended(&aborted());
     let (code, _, errors) = run(&["report", folder.to_str().unwrap(), "--qif"], home.path());
     assert_eq!(code, 2);
-    assert!(errors.contains("no measurement of this run could be registered"), "{errors}");
+    for piece in ["mirror-1", "no measurement"] {
+        assert!(errors.contains(piece), "{piece}: {errors}");
+    }
     assert!(!folder.join("results.qif").exists());
 }
 
@@ -151,10 +153,10 @@ fn other_readers_read_dfq() {
     let found: Vec<&Value> = values.iter().map(|one| &one["value"]).collect();
     assert_eq!(found, [0.009, 0.0068, 0.006, 0.006]);
     assert!(values.iter().all(|one| one["part"] == "SN 7" && one["attribute"] == 0), "{values:?}");
-    assert!(
-        values[0]["text"].as_str().unwrap().starts_with("cycle 1, continue; U (k = 2) 0.000500000 mm"),
-        "{values:?}"
-    );
+    let text = values[0]["text"].as_str().unwrap();
+    for piece in ["cycle 1, continue", "U (k = 2) 0.000500000 mm"] {
+        assert!(text.contains(piece), "{piece}: {values:?}");
+    }
 }
 
 #[test]

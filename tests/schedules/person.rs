@@ -131,7 +131,7 @@ pub async fn give(
     let reply = orders.send_and_wait(request(reason.clone()), actor()).await;
     let Some(reply) = reply.filter(|_| !life.is_dead()) else { return };
     let accepted = reply.taken;
-    let done = accepted || reply.message.contains("make the cell safe were carried out");
+    let done = accepted || reply.message.contains("make the cell safe");
     given.lock().unwrap().push(GivenOrder { at, answered: Instant::now(), what, reason, accepted, done, moved });
 }
 

@@ -452,7 +452,9 @@ fn ending_names_best_cycle() {
     });
     run.start().run_to_rest();
     let Some(Ending::NotAccepted { reason, .. }) = run.ending() else { panic!("{:?}", run.ending()) };
-    assert!(reason.contains("best cycle 2: PV 9.00 µm, RMS 1.50 µm") && reason.contains("cycle-2"), "{reason}");
+    for piece in ["best cycle 2", "PV 9.00 µm", "RMS 1.50 µm", "cycle-2"] {
+        assert!(reason.contains(piece), "{piece}: {reason}");
+    }
 }
 
 #[test]
@@ -492,7 +494,7 @@ fn verdict_accept_undecided_or_stalled() {
     let said = |words: &str| {
         run.commands.iter().any(|c| matches!(c, Command::Announce(judgement) if judgement.reason.contains(words)))
     };
-    assert!(said("4 of 8 contributions to the uncertainty are not stated and count as 0"));
+    assert!(said("4 of 8 contributions"));
     // By the figure alone, where the recipe says so.
     let alone = CellPlan { tolerance: Tolerance { with_uncertainty: false, ..plan().tolerance }, ..plan() };
     let mut run = TestRun::new(alone, |_| figures(6.99, 0.99));
@@ -560,7 +562,9 @@ fn stalled_without_forecast_improvement() {
     assert_eq!(run.verdicts(), [Verdict::Continue, Verdict::Stalled]);
     assert!(matches!(run.ending(), Some(Ending::NotAccepted { .. })) && run.cell.state() == State::Stopped);
     let told = &run.judgements().last().unwrap().reason;
-    assert!(told.contains("no improvement expected") && told.contains("another pass: RMS 6.00 µm ± 0.02 µm"), "{told}");
+    for piece in ["no improvement expected", "RMS 6.00 µm ± 0.02 µm"] {
+        assert!(told.contains(piece), "{piece}: {told}");
+    }
 }
 
 #[test]
@@ -671,11 +675,13 @@ fn unconfirmed_abort_ends_by_timeout() {
         run.send(Event::Deadline);
     }
     assert_eq!(run.cell.state(), State::Aborted);
-    assert_eq!(run.cell.in_words(), "Aborted: neither machine has confirmed that it is at rest");
+    assert_eq!(run.cell.unconfirmed(), Device::BOTH);
+    assert!(run.cell.in_words().contains("neither machine"), "{}", run.cell.in_words());
     assert!(matches!(run.ending(), Some(Ending::Aborted { confirmed: false, .. })));
     let alarm =
         run.commands.iter().find_map(|c| if let Command::Raise(a) = c { Some(a.clone()) } else { None }).unwrap();
-    assert!(alarm.remedy[0].contains("the machine's own emergency circuit"), "{alarm:?}");
+    assert_eq!(alarm.id, AlarmId::StopNotConfirmed);
+    assert!(alarm.remedy[0].contains("emergency circuit"), "{alarm:?}");
     // One of them has.
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run))).send(abort());
@@ -685,7 +691,8 @@ fn unconfirmed_abort_ends_by_timeout() {
         run.send(Event::Deadline);
     }
     assert_eq!(run.cell.unconfirmed(), [Device::Grinder]);
-    assert_eq!(run.cell.in_words(), "Aborted: the grinder has not confirmed that it is at rest");
+    assert_eq!(run.cell.state(), State::Aborted);
+    assert!(run.cell.in_words().contains("the grinder"), "{}", run.cell.in_words());
     // Both have, and neither was seen clear.
     let mut run = TestRun::accepted_after_two_passes();
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run))).send(abort());
@@ -1389,7 +1396,8 @@ fn alarm_names_device_code_and_message() {
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(Event::Fault { device: Device::Grinder, code: 5, message: "drive".into() });
     let Some(Command::Raise(alarm)) = run.commands.iter().find(|c| matches!(c, Command::Raise(_))) else { panic!() };
-    assert_eq!(alarm.what, "A machine is in fault: grinder, fault 5, drive.");
+    assert_eq!(alarm.id, AlarmId::MachineFault);
+    assert!(alarm.what.contains("grinder, fault 5, drive"), "{}", alarm.what);
     assert!(AlarmId::ALL.len() > 30);
 }
 
@@ -1483,8 +1491,9 @@ fn reconnect_holds_running_machine() {
     run.now = run.cell.next_deadline().unwrap();
     run.send(Event::Deadline);
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Reconcile)));
+    assert_eq!(run.cell.state().unconfirmed(), Some(device));
     let message = run.cell.state().to_string();
-    assert!(message.ends_with("the grinder has not confirmed that it is at rest"), "{message}");
+    assert!(message.contains("the grinder"), "{message}");
     run.send(Event::LinkBack { device, boot_id: 7 });
     let commands = run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Running });
     assert_eq!(commands.last(), Some(&Command::HoldMachine { device }));
@@ -1546,8 +1555,10 @@ fn manual_mode_holds_and_blocks_start() {
         let commands = run.send(by_hand(device));
         let Some(Command::Raise(alarm)) = commands.first() else { panic!("{commands:?}") };
         assert_eq!(alarm.id, AlarmId::NotAutomatic);
-        assert!(alarm.what.contains(&format!("{device}, it is in manual mode")), "{}", alarm.what);
-        assert_eq!(alarm.what.contains("while the grinder runs its job"), device == Device::Cmm, "{}", alarm.what);
+        assert!(alarm.what.contains("it is in manual mode"), "{}", alarm.what);
+        // The machine in manual mode is named, and beside it the grinder, which runs its job.
+        let named = Device::BOTH.map(|other| alarm.what.contains(&other.to_string()));
+        assert_eq!(named, Device::BOTH.map(|other| other == device || other == Device::Grinder), "{}", alarm.what);
         assert_eq!(commands.last(), Some(&Command::HoldMachine { device: Device::Grinder }));
         run.run_until(State::Held(Phase::Grind(JobStep::Run)));
         // Nobody goes on beside it.
@@ -1632,11 +1643,9 @@ fn progress_timeout_alarms_then_holds() {
     let commands = run.send(Event::Deadline);
     let Some(Command::Raise(alarm)) = commands.first() else { panic!("{commands:?}") };
     assert_eq!((alarm.id, commands.len()), (AlarmId::ProgressStands, 1));
-    assert!(
-        alarm.what.contains("grinder, no progress for 30 s; without progress, the cell holds this machine in 30 s"),
-        "{}",
-        alarm.what
-    );
+    for piece in ["grinder", "for 30 s", "in 30 s"] {
+        assert!(alarm.what.contains(piece), "{piece}: {}", alarm.what);
+    }
     assert_eq!((run.cell.state(), due(&run)), (run_state, 30 * SECOND));
     // It goes on: the alarm goes away by itself.
     let progressed = |done| Event::Progressed { device, done, total: 1000 };

@@ -155,7 +155,7 @@ pub(super) fn retire(arguments: &ToRetire) -> Result<Outcome, Failure> {
             super::super::print(&format!("the cell {name} can no longer sign in; the plant keeps its records\n"))?;
             return Ok(Outcome::Accepted);
         }
-        super::super::print(&format!("there is no cell {name}; `regrind plant cells` lists them\n"))?;
+        super::super::print(&format!("there is no cell {name}; to see all cells: `regrind plant cells`\n"))?;
         Ok(Outcome::NotInTolerance)
     })
 }

@@ -235,7 +235,7 @@ fn begin(arguments: &ToBegin) -> Result<Outcome, Failure> {
         let sets: Vec<Value> = sets.into_iter().map(Value::Object).collect();
         let jobs = study.begin(&link, &sets, &seeds).await?;
         super::super::print(&format!(
-            "{}: {}; to run them: regrind study work\n",
+            "{}: {} created; to run the jobs of the study: regrind study work\n",
             study.name,
             super::super::words::counted(jobs, "job")
         ))?;
@@ -297,7 +297,7 @@ fn made_of(study: &Study, job: &LeasedRun) -> Result<Value, String> {
         let inside = Path::new(name);
         if !is_below(inside) {
             return Err(format!(
-                "the recipe names the file {name:?}, which is outside of the folder of the recipe; begin the study again"
+                "the recipe names the file {name:?}, which is outside of the folder of the recipe; move the file into this folder, and begin the study again"
             ));
         }
         write(&scratch.path().join(inside), content)?;

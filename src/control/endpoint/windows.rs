@@ -183,7 +183,7 @@ fn block_on_thread<T: Send + 'static>(what: impl Future<Output = io::Result<T>> 
     let thread = std::thread::Builder::new().spawn(move || {
         tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?.block_on(what)
     })?;
-    thread.join().unwrap_or_else(|_| Err(io::Error::other("this program failed; send the request again")))
+    thread.join().unwrap_or_else(|_| Err(io::Error::other("an internal error of Regrind; send the request again")))
 }
 
 #[cfg(test)]

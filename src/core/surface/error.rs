@@ -34,7 +34,7 @@ pub enum SurfaceError {
          patches, or give a mesh"
     )]
     NoProjection { tried: String },
-    #[error("the nominal mesh has no triangle; give a file with faces")]
+    #[error("the nominal mesh has no triangle; export a file that contains triangles")]
     NoTriangles,
     #[error(
         "a triangle of the nominal mesh names vertex {vertex}, but the mesh has {points} vertices, counted \

@@ -703,7 +703,7 @@ fn stored_plan(folder: &Path) -> Result<Plan, ExchangeError> {
         stored_target(row).ok_or_else(|| FormatError::Unexpected {
             path: path.clone(),
             place: format!("line {line}"),
-            expected: "an unchanged target of the plan that was handed over".to_owned(),
+            expected: "a target row exactly as Regrind wrote this row".to_owned(),
             found: row.chars().take(40).collect(),
         })
     };

@@ -80,8 +80,8 @@ pub enum ExchangeError {
     Confirmation { path: PathBuf, found: String, expected: String, remedy: &'static str },
     /// The same job and cycle was handed over before.
     #[error(
-        "job {job} cycle {cycle} was already handed over (see {folder}), and Regrind hands over each job and cycle \
-         only once"
+        "job {job} cycle {cycle} was already handed over (see {folder}); Regrind does not hand over the same cycle of \
+         a job twice"
     )]
     HandedOver { job: u32, cycle: u16, folder: PathBuf },
     /// The client had stopped waiting for the hand-over, so it was not published.
@@ -97,7 +97,7 @@ pub enum ExchangeError {
     )]
     OtherMap { expected: [u8; 32], found: [u8; 32] },
     /// No hand-over of the job is open.
-    #[error("no hand-over of job {job} cycle {cycle} waits for an answer")]
+    #[error("job {job} cycle {cycle} has no open hand-over, so no confirmation is expected")]
     NotOpen { job: u32, cycle: u16 },
     /// The hand-over is not where it was put.
     #[error(

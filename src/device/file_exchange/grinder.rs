@@ -80,15 +80,16 @@ impl Confirmation {
         let (map, identity) = (self.map.trim().to_lowercase(), &ticket.identity);
         if map.len() < 8 || !identity.starts_with(&map) {
             let found = if map.is_empty() { "no map".to_owned() } else { format!("map `{}`", self.map) };
-            let remedy =
-                "check which map the grinder has; then copy the confirmation from the folder of the hand-over again";
+            let remedy = "check which map the grinder has; then copy the confirmation file from the folder of the \
+                          hand-over to the inbox again";
             return wrong(found, format!("map {identity}"), remedy);
         }
         let job = (self.job.unwrap_or(ticket.job), self.cycle.unwrap_or(ticket.cycle));
         if job != (ticket.job, ticket.cycle) {
             let (found, expected) =
                 (format!("job {} cycle {}", job.0, job.1), format!("job {} cycle {}", ticket.job, ticket.cycle));
-            return wrong(found, expected, "copy the confirmation from the folder of the hand-over again");
+            let remedy = "copy the confirmation file from the folder of the hand-over to the inbox again";
+            return wrong(found, expected, remedy);
         }
         let positive = |value: Option<f64>| value.is_none_or(|v| v.is_finite() && v >= 0.0);
         if !positive(self.wheel_radius_mm)

@@ -278,7 +278,7 @@ impl ExchangeWire {
             if stars[0] != stars[1] && stars[0].max(stars[1]) == 1 {
                 let key = place.key(&format!("wire.stations[{k}].reference"));
                 let found = format!("is {reference:?}, and `points` is {points:?}");
-                document.report(&key, found, "`*` must be in both names or in none", "add the `*`");
+                document.report(&key, found, "use `*` in both `points` and `reference`, or in neither", "add the `*`");
             }
         }
     }

@@ -115,7 +115,8 @@ impl HitLinesCmm {
                         asked.job.batch_id(),
                         hearing.plan_digits()
                     ),
-                    "check: right part, clean, clamped; wheel clear of the part; probe as in the list".to_owned(),
+                    "check: right part, clean, clamped; wheel clear of the part; probe radius as in the plan"
+                        .to_owned(),
                 ];
                 if self.settings.clear_after.is_none() {
                     prompt.push("when the part is measured and the probe is clear of the part,".to_owned());
@@ -173,7 +174,8 @@ impl HitLinesCmm {
                 Ok(Vec::new())
             }
             (OperatorConfirmation::Started { .. }, _) => {
-                Err("the start of a measurement needs no confirmation: measure, then confirm done".to_owned())
+                Err("the start of a measurement needs no confirmation: measure, then type regrind confirm done"
+                    .to_owned())
             }
             (_, state) => Err(format!("the machine is {state}; no confirmation of this kind is expected")),
         };
@@ -409,7 +411,7 @@ impl Machine for HitLinesCmm {
                 Reconciled::Running(status_of(&hearing))
             }
             _ => Reconciled::Unknown {
-                reason: "the machine does not report the outcome of the job; ask the operator".to_owned(),
+                reason: "the machine does not report the outcome of the job; ask the person at the machine whether the job was done".to_owned(),
             },
         })
     }

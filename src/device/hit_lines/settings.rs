@@ -350,7 +350,12 @@ impl HitLinesWire {
             (None, Some(_)) if self.port == 0 && place.simulated == Some(false) => {
                 let found = "is 0 in a cell that is not simulated";
                 let allowed = "the port must be a whole number from 1 to 65535";
-                document.report(&place.key("wire.port"), found, allowed, "check the settings of the terminal server");
+                document.report(
+                    &place.key("wire.port"),
+                    found,
+                    allowed,
+                    "write the port number from the settings of the terminal server",
+                );
             }
             _ => {}
         }
@@ -359,18 +364,18 @@ impl HitLinesWire {
     fn check_format(&self, document: &mut Document) {
         let Some(format) = self.format else { return };
         if format.is_integer() && self.unit == Unit::Inch {
-            let found = "is inch, but the format has whole numbers";
-            let allowed = "whole numbers are in µm";
+            let found = "is inch, but a format of whole numbers cannot have inches";
+            let allowed = "whole numbers are always in µm";
             document.report("cmm.wire.unit", found, allowed, "remove this key, or set the machine to print decimals");
         }
         if self.decimal == Mark::Comma && self.separator == Separator::Comma && !format.is_integer() {
-            let found = "is \"comma\", the same as the separator";
+            let found = "is \"comma\", but the separator between two values is a comma too";
             let allowed = "one mark cannot be both";
             document.report("cmm.wire.decimal", found, allowed, "set `separator` to the mark between two values");
         }
         if format.is_lettered() && self.axes != Axes::Xyz {
-            let found = "is given, but the lines have letters";
-            document.report("cmm.wire.axes", found, "the letters name the axes", "remove it");
+            let found = "is given, but the format already has a letter for the axis of each value";
+            document.report("cmm.wire.axes", found, "only a format without letters allows this key", "remove this key");
         }
     }
 }

@@ -102,7 +102,7 @@ impl TargetList {
         if away_mm > limit_mm {
             return Err(format!(
                 "the touch is {away_mm:.3} mm from the nearest target, {index}; the limit (limit_mm) is {limit_mm} mm: \
-                 check that the right part is at the position of the cell file, and touch the target again"
+                 check that the right part is at the position in the cell file, and touch the target again"
             ));
         }
         match (self.points[k].replace(point(index)), self.rules.repeated) {
@@ -113,7 +113,8 @@ impl TargetList {
                 let apart_mm = distance(first.position_mm, at_mm);
                 Err(format!(
                     "target {index} was already touched, {apart_mm:.4} mm from this touch; the first touch remains \
-                     valid: continue with the remaining targets, or write repeated = \"replace\" into the cell file"
+                     valid: continue with the remaining targets. If the last touch of a target must replace the first \
+                     touch, write repeated = \"replace\" into the cell file"
                 ))
             }
         }

@@ -286,21 +286,25 @@ fn enumerated(item: &Item, items: &[Item]) -> Result<(), SyntaxError> {
     }
     tool(&parts)?;
     if parts.len() > 1 && !matches!(parts[1], "GoToPar" | "PtMeasPar" | "ScanPar") {
-        return Err(bad("the second part must be GoToPar, PtMeasPar or ScanPar"));
+        return Err(bad("the second part of the property name must be GoToPar, PtMeasPar or ScanPar"));
     }
     third_and_fourth(&parts, &["Act", "Def", "Max", "Min"])
 }
 
 fn tool(parts: &[&str]) -> Result<(), SyntaxError> {
-    if matches!(parts[0], "Tool" | "FoundTool") { Ok(()) } else { Err(bad("the first part must be Tool or FoundTool")) }
+    if matches!(parts[0], "Tool" | "FoundTool") {
+        Ok(())
+    } else {
+        Err(bad("the first part of the property name must be Tool or FoundTool"))
+    }
 }
 
 fn third_and_fourth(parts: &[&str], fourth: &[&str]) -> Result<(), SyntaxError> {
     if parts.get(2).is_some_and(|part| !PARAMETERS.contains(part)) {
-        return Err(bad("the third part is not the name of a parameter"));
+        return Err(bad("the third part of the property name is not the name of a parameter"));
     }
     if parts.get(3).is_some_and(|part| !fourth.contains(part)) {
-        return Err(bad("the fourth part is not allowed; Act is allowed"));
+        return Err(bad("the fourth part of the property name is not allowed here; the part Act is allowed"));
     }
     if parts.len() > 4 { Err(arguments("the name of a property has at most four parts")) } else { Ok(()) }
 }
@@ -311,14 +315,18 @@ fn check_read_property(parts: &[&str], values: &[Item]) -> Result<(), SyntaxErro
     }
     tool(parts)?;
     match parts {
-        [_] => Err(arguments("the name of a tool is not a property: a second part is required")),
-        ["FoundTool", "Alignment"] => Err(arguments("only the active tool has an alignment")),
+        [_] => {
+            Err(arguments("the property name has only one part, the tool: add a second part, for example Tool.Name"))
+        }
+        ["FoundTool", "Alignment"] => {
+            Err(arguments("FoundTool has no alignment: only the active tool (Tool) has an alignment"))
+        }
         [
             _,
             "Alignment" | "CollisionVolume" | "Id" | "Name" | "AvrRadius" | "AvrOffsets" | "QualSigma" | "QualTime",
         ] => Ok(()),
         [_, "GoToPar" | "PtMeasPar" | "ScanPar", _, ..] => third_and_fourth(parts, &["Act", "Def", "Max", "Min"]),
-        _ => Err(bad("the second part is not the name of a tool property")),
+        _ => Err(bad("the second part of the property name is not the name of a tool property")),
     }
 }
 
@@ -327,7 +335,7 @@ fn set(parts: &[&str], values: &[Item]) -> Result<(), SyntaxError> {
     match parts {
         [_] | [_, _] => Err(arguments("the name of a property to set must have three or four parts")),
         [_, "GoToPar" | "PtMeasPar" | "ScanPar", _, ..] => third_and_fourth(parts, &["Act"]),
-        _ => Err(bad("the second part must be GoToPar, PtMeasPar or ScanPar")),
+        _ => Err(bad("the second part of the property name must be GoToPar, PtMeasPar or ScanPar")),
     }?;
     match (values.len(), parts.len()) {
         (1, _) => Ok(()),

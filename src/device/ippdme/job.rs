@@ -282,7 +282,8 @@ impl Worker {
         let mut shared = locked(&self.shared);
         if shared.state == MachineState::Execute && shared.last_status_request.elapsed() > self.settings.silence_limit {
             shared.state = MachineState::Holding;
-            shared.stop_reason = Some("Regrind sent no status request for too long, so the machine holds".to_owned());
+            shared.stop_reason =
+                Some("the machine holds, because Regrind sent no status request within the time limit".to_owned());
             return JobRequest::Hold;
         }
         *self.job_request.borrow()
@@ -358,7 +359,7 @@ impl Worker {
         let told = self.request_if_supported("GetProp", vec![Item::property_query("Tool.AvrRadius")]).await?;
         let Some(told) = told else {
             self.session
-                .note("the machine does not report the tool radius; the radius of each touch is checked".to_owned());
+                .note("the machine does not report the radius of the tool; Regrind checks the radius that the machine reports for each touch".to_owned());
             return Ok(());
         };
         let missing = || self.missing_value("GetProp", "Tool.AvrRadius");
@@ -514,7 +515,7 @@ impl Worker {
         if off_mm <= most {
             return Ok(());
         }
-        let field = format!("the distance of the touch of target {} from the target", target.index);
+        let field = format!("the distance of the touch from the target {}", target.index);
         let (machine, unit) = (Arc::clone(&self.session.machine), "mm".to_owned());
         Err(Failure::Implausible(DeviceError::OutOfRange { machine, field, value: off_mm, min: 0.0, max: most, unit }))
     }

@@ -315,7 +315,9 @@ impl Session {
             (Tag::UNSOLICITED, _) => Ok(()),
             (Tag::Command(number), _) if self.was_sent(number) => Ok(()),
             (Tag::Event(number), _) if number <= self.last_event => Ok(()),
-            (tag, _) => Err(Failure::Link(self.unreadable(tag.to_string(), "the line answers a request never sent"))),
+            (tag, _) => Err(Failure::Link(
+                self.unreadable(tag.to_string(), "the line is an answer to a request that was never sent"),
+            )),
         }
     }
 
@@ -342,9 +344,9 @@ impl Session {
 
     fn parse_response(&mut self, line: std::io::Result<String>) -> Result<DmeResponse, Failure> {
         let line = line.map_err(|e| match e.kind() {
-            std::io::ErrorKind::InvalidData => {
-                Failure::Link(self.unreadable(String::new(), "the line has no end, or is not ASCII"))
-            }
+            std::io::ErrorKind::InvalidData => Failure::Link(
+                self.unreadable(String::new(), "the line is too long: no line end within 65536 characters"),
+            ),
             _ => Failure::Link(self.disconnected("reading")),
         })?;
         DmeResponse::read(&line).map_err(|flaw| Failure::Link(self.unreadable(line, flaw.reason)))

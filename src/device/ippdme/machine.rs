@@ -277,7 +277,7 @@ impl Machine for IppdmeCmm {
         let shared = locked(&self.shared);
         let way = self.memory.loaded.as_ref().map(|(work, _)| {
             let Route { travel_m, plan_order_m: plain_m, .. } = work.route;
-            format!("the travel between targets is {travel_m:.2} m; in the plan's order the travel is {plain_m:.2} m")
+            format!("the travel between targets is {travel_m:.2} m; in the order of the plan, the travel would be {plain_m:.2} m")
         });
         let why = shared.stop_reason.iter().cloned();
         why.chain(shared.notes.iter().cloned()).chain(way).collect()
@@ -460,13 +460,12 @@ impl Machine for IppdmeCmm {
         }
         if self.memory.unresolved.take_if(|untold| Some(*untold) == key).is_some() && shared.state == MachineState::Idle
         {
-            let gone =
-                "the server stores no job: the machine has stopped, and the touches of the interrupted run are lost";
+            let gone = "the machine has stopped, and the touches of the interrupted run are lost, because an I++ DME server does not store a job";
             (shared.job, shared.state, shared.outcome) = (key, MachineState::Complete, Outcome::Failed);
             (shared.stop_reason, shared.clear_of_part) = (Some(gone.to_owned()), None);
             return Ok(Reconciled::Finished(self.status_of(&shared)));
         }
-        let why = "the server stores no job, and Regrind has no record of a job with this START number".to_owned();
+        let why = "an I++ DME server does not store a job, and Regrind has no record of a job with this START number: check at the machine whether the job was done".to_owned();
         Ok(Reconciled::Unknown { reason: why })
     }
 }

@@ -33,7 +33,7 @@ impl Worker {
         if locked(&self.shared).radius_mm.is_none() {
             // A point of a scan does not report the radius either.
             self.session
-                .note("the machine does not report the tool radius, so rows are touched instead of scanned".to_owned());
+                .note("the machine does not report the radius of the tool, so each row is touched point by point, not scanned".to_owned());
             return Ok(());
         }
         let wanted = [("ScanPar.Speed", scan.speed_mm_s), ("ScanPar.Retract", work.plan.approach_mm)];
@@ -69,7 +69,7 @@ impl Worker {
             Ok(answer) => Some(self.decode_scan(work, targets, &answer.data)?),
             Err(Failure::Refused(error)) if is_missed(&error) && error.severity <= 2 => {
                 self.session.note(format!(
-                    "the row from target {} is touched, because the scan failed: {error}",
+                    "the scan of the row from target {} failed, so this row is touched point by point: {error}",
                     targets[0].index
                 ));
                 self.session.clear_errors(1).await?;

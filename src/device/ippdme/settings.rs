@@ -145,7 +145,7 @@ impl DriverFactory for IppdmeWire {
         }
         self.check_address(place, document);
         if !document.contains_key("cmm.travel") {
-            let allowed = "every position is checked against the machine's volume before the machine moves";
+            let allowed = "[cmm.travel] must give the volume of the machine, because Regrind checks every position before the machine moves";
             document.report("cmm.wire.kind", "is \"ippdme\" without [cmm.travel]", allowed, "add min_mm and max_mm");
         }
         if self.tool.contains(['"', '\r', '\n']) || !self.tool.is_ascii() {

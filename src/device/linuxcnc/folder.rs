@@ -70,9 +70,10 @@ impl Folders {
         write_atomic(&file, &program.text).map_err(|error| error.to_string())?;
         match lies_there(&file) {
             true => Ok(()),
-            false => {
-                Err(format!("the file {} differs from the data that Regrind wrote: check the folder", file.display()))
-            }
+            false => Err(format!(
+                "the file {} differs from the data that Regrind wrote: check the disk, and whether another program writes into this folder",
+                file.display()
+            )),
         }
     }
 

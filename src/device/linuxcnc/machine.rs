@@ -323,16 +323,18 @@ impl Machine for LinuxcncGrinder {
         let ended = match word {
             OperatorConfirmation::Started { .. } => {
                 return Err(not_taken(
-                    "the grinder has stopped: confirm done if the pass is complete, otherwise still",
+                    "the grinder has stopped, so the begin cannot be confirmed: type regrind confirm done if the pass is complete, otherwise regrind confirm still",
                 ));
             }
             OperatorConfirmation::Done { file: Some(_), .. } => {
-                return Err(not_taken("only a measurement has a file: remove --file"));
+                return Err(not_taken("--file is allowed only for a measurement: remove --file"));
             }
             OperatorConfirmation::Done { map_identity: Some(map), .. }
                 if program.is_none_or(|program| program.map != map) =>
             {
-                return Err(not_taken("the confirmed map is not the map of the program: check which program ran"));
+                return Err(not_taken(
+                    "the map in the confirmation is not the map of the prepared program: check which program ran at the grinder",
+                ));
             }
             OperatorConfirmation::Done { .. } => Stage::Ended(MachineState::Complete, Outcome::Complete),
             OperatorConfirmation::Still => Stage::Ended(MachineState::Complete, Outcome::Stopped),

@@ -64,7 +64,7 @@ impl FramedProgram {
         let record = path(order.folder, &name, RECORD);
         if record.len() > MAX_PATH_LENGTH {
             return Err(format!(
-                "the path of the .log file is longer than {MAX_PATH_LENGTH} characters: {record}; use a shorter folder"
+                "the path of the .log file is longer than {MAX_PATH_LENGTH} characters: {record}; use a folder with a shorter path"
             ));
         }
         let says = |word: &str| format!("(LOGAPPEND,{record})\n(LOG,{word})\n(LOGCLOSE)\n");

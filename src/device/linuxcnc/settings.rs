@@ -212,8 +212,8 @@ impl LinuxcncWire {
         let key = place.key("wire.executed_path");
         match (place.simulated, &self.executed_path) {
             (Some(true), None) => {
-                let allowed = "a simulated wheel follows the path that LinuxCNC executes";
-                let remedy = "name the program that prints this path (docs/linuxcnc.md), or write `simulated = false`";
+                let allowed = "a simulated wheel requires the path that LinuxCNC executes";
+                let remedy = "write the program that prints the executed path into the key `executed_path` (docs/linuxcnc.md), or write `simulated = false`";
                 document.report(&place.key("wire.kind"), "is \"linuxcnc\" in a simulated cell", allowed, remedy);
             }
             (Some(false), Some(_)) => {

@@ -228,10 +228,10 @@ impl ManualMachine {
             OperatorConfirmation::Started { map_identity } | OperatorConfirmation::Done { map_identity, .. }
                 if self.names_other_map(map_identity) =>
             {
-                Err(self.not_accepted("the map is not the requested map: check which program is in the grinder"))
+                Err(self.not_accepted("the map in the confirmation is not the map of this pass: check which program is in the grinder"))
             }
             OperatorConfirmation::Started { .. } if is_cmm => {
-                Err(self.not_accepted("the start of a measurement needs no confirmation: measure, then confirm done"))
+                Err(self.not_accepted("the start of a measurement needs no confirmation: measure, then type regrind confirm done --file RESULT"))
             }
             OperatorConfirmation::Started { .. } if self.state == MachineState::Execute => {
                 self.started_at.get_or_insert_with(Instant::now);
@@ -243,7 +243,7 @@ impl ManualMachine {
                 let kept = match file {
                     Some(file) if is_cmm => self.accept_file(file).await?,
                     None if is_cmm => return Err(self.not_accepted("name the file of the measurement with --file")),
-                    Some(_) => return Err(self.not_accepted("only a measurement has a file: remove --file")),
+                    Some(_) => return Err(self.not_accepted("--file is allowed only for a measurement: remove --file")),
                     None if self.started_at.is_none() => {
                         return Err(self.not_accepted("confirm first that the pass has begun: regrind confirm started"));
                     }
@@ -263,7 +263,7 @@ impl ManualMachine {
                 Ok(Vec::new())
             }
             _ => {
-                let why = format!("the machine is {}; no confirmation of this kind is expected", self.state);
+                let why = format!("the machine is in the state {}, which does not allow this confirmation", self.state);
                 Err(self.not_accepted(why))
             }
         }
@@ -513,7 +513,7 @@ impl Machine for ManualMachine {
                 Reconciled::Running(self.current_status())
             }
             _ => Reconciled::Unknown {
-                reason: "the machine does not report the outcome of the job; ask the operator".to_owned(),
+                reason: "the machine does not report the outcome of the job; ask the person at the machine whether the job was done".to_owned(),
             },
         })
     }

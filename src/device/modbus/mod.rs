@@ -712,7 +712,7 @@ impl ModbusMachine {
         let head = |identity: &[u8; 32]| identity[..8].iter().fold(0, |bits, byte| (bits << 8) | u64::from(*byte));
         self.compare([
             ("the kind of the payload that the machine uses", u64::from(kind), u64::from(words[0])),
-            ("the state of the slot of the payload that the machine uses", 1, u64::from(words[1])),
+            ("the state of the memory slot whose payload the machine uses", 1, u64::from(words[1])),
             ("the size of the payload that the machine uses", u64::from(slot.bytes), u64::from(block.u32(2))),
             ("the CRC-32 of the payload that the machine uses", u64::from(slot.crc), u64::from(block.u32(4))),
             (
@@ -1006,7 +1006,7 @@ fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
     if status.boot_id != boot_id {
         let is = status.boot_id;
         return unknown(format!(
-            "the machine was restarted after this job was prepared (boot id {boot_id:08x}, now {is:08x}); check the part"
+            "the machine was restarted after this job was prepared (boot id {boot_id:08x}, now {is:08x}); check at the machine whether the job was done"
         ));
     }
     if status.begun_by == start_sequence {

@@ -345,7 +345,10 @@ impl RegisterMap {
             let end = u32::from(first) + u32::from(count);
             let key = place.key(&format!("registers.{name}"));
             if end > REGISTERS {
-                let found = format!("is {first}; the block has {count} registers and ends at register {}", end - 1);
+                let found = format!(
+                    "is {first}; the block of {count} registers would end at register {}, which does not exist",
+                    end - 1
+                );
                 document.report(&key, found, "the last register of a device is 65535", "lower it");
             }
             for &(other, start, length) in &blocks[..k] {
@@ -485,7 +488,10 @@ impl Signal {
             }
             let last = u32::from(signal.address) + u32::from(signal.kind.registers()) - 1;
             if last >= REGISTERS {
-                let found = format!("is {}; the value ends at register {last}", signal.address);
+                let found = format!(
+                    "is {}; the last register of the value would be {last}, which does not exist",
+                    signal.address
+                );
                 document.report(&key("address"), found, "the last register of a device is 65535", "lower it");
             }
             signals.push(signal);

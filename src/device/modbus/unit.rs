@@ -424,7 +424,7 @@ fn layout_fault(words: &[u16], order: WordOrder) -> Option<Cow<'static, str>> {
         let fits = if is_whole(other) { other } else { other.with_words_swapped() };
         Some(
             format!(
-                "but the two bytes of each register are in the other order than in the cell file: write word_order = \"{}\" \
+                "the two bytes of each register are in the other order than in the cell file: write word_order = \"{}\" \
              in the cell file, or set the server of the machine or the gateway to send the other byte first",
                 fits.name()
             )
@@ -432,13 +432,13 @@ fn layout_fault(words: &[u16], order: WordOrder) -> Option<Cow<'static, str>> {
         )
     } else if begins(2, as_it_is) || begins(2, swapped) {
         Some(
-            "but one register later than in the cell file: the server of the machine counts from 1, but the protocol \
+            "the block is one register later than in the cell file: the server of the machine counts from 1, but the protocol \
              counts from 0; correct the addresses of the server, or add 1 to each address in the table `registers` of the cell file"
                 .into(),
         )
     } else if begins(0, as_it_is) || begins(0, swapped) {
         Some(
-            "but one register earlier than in the cell file: the server of the machine subtracts 1 from each address; correct \
+            "the block is one register earlier than in the cell file: the server of the machine subtracts 1 from each address; correct \
              the addresses of the server, or subtract 1 from each address in the table `registers` of the cell file"
                 .into(),
         )

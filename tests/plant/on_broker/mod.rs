@@ -130,12 +130,12 @@ fn sparkplug_values_and_refused_commands() {
     told.host.does(&json!({ "name": "Status/StateCurrent", "type": "UINT32", "value": 2 }));
     told.host.does(&json!({ "name": "Hold", "type": "BOOLEAN", "value": true, "device": "cell" }));
     told.host.does(&json!({ "raw": "ff00ff" }));
-    for refused in
-        ["NCMD: Status/StateCurrent = 2", "DCMD: Hold = true", "NCMD: a message that is not a Sparkplug B command"]
+    for (kind, refused) in
+        [("NCMD: ", "Status/StateCurrent = 2"), ("DCMD: ", "Hold = true"), ("NCMD: ", "Sparkplug B command")]
     {
-        teller.line(refused, |line| line.contains("\"refused\"") && line.contains(refused));
+        teller.line(refused, |line| ["\"refused\"", kind, refused].iter().all(|piece| line.contains(piece)));
         let station = until_recorded(&mut running, &folder, refused);
-        assert!(station.contains("somebody at the broker 127.0.0.1"), "{station}");
+        assert!(station.contains("broker 127.0.0.1"), "{station}");
     }
     told.host.does(&json!({ "name": "Node Control/Rebirth", "type": "BOOLEAN", "value": true }));
     let again = heard(&mut told.host, from, "NBIRTH");
@@ -215,7 +215,9 @@ fn sparkplug_killed_run_is_not_idle() {
     let values = until_value(&mut told.host, "Status/StateCurrent", &Value::Null);
     assert_eq!(values["Run"], json!(folder.file_name().unwrap().to_str().unwrap()));
     let message = values["Message"].as_str().unwrap();
-    assert!(message.contains("and its simulated machines with it"), "{message}");
+    for piece in [folder.file_name().unwrap().to_str().unwrap(), "simulated machines"] {
+        assert!(message.contains(piece), "{piece}: {message}");
+    }
     assert_eq!(
         (&values["Figures/PV"], &values["Status/StateName"], &values["Last Run/Name"]),
         (&Value::Null, &Value::Null, &json!(name))
@@ -280,17 +282,17 @@ fn broker_certificate_is_verified() {
             format!("port = {port}\ngroup = \"plant\"\nuser = \"cell-1\"\npassword_file = \"password\"\n{more}");
         write_plant(home.path(), &lines);
     };
-    let refused = |words: &str| {
+    let refused = |pieces: [&str; 2]| {
         let (code, out, errors) = run(&["tell", "--plant", "plant.toml"], home.path());
-        assert!(code == 2 && errors.contains(words), "{code} {out}{errors}");
+        assert!(code == 2 && pieces.iter().all(|piece| errors.contains(piece)), "{code} {out}{errors}");
     };
     let readable = |mode| fs::set_permissions(home.path().join("password"), fs::Permissions::from_mode(mode)).unwrap();
 
     plant("broker = \"plant.example\"\n");
-    refused("plant.example is another computer, but no certificates to authenticate the other computer are given");
+    refused(["plant.example", "`certificates`"]);
     plant("broker = \"localhost\"\ncertificates = \"its.pem\"\n");
     readable(0o644);
-    refused("other users of this computer can read the password");
+    refused(["password", "chmod"]);
     readable(0o600);
 
     plant("broker = \"localhost\"\ncertificates = \"foreign.pem\"\n");

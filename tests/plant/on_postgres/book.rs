@@ -65,17 +65,12 @@ fn plant_guide_walked_through() {
         }
     }
     let all = said.concat();
-    let shown = [
-        "layout",
-        "cell-4 signs in as cell_4",
-        "the local journal contains these records",
-        "SN-0001",
-        "to be signed by two people",
-    ];
-    for words in shown {
+    for words in ["layout", "signs in as cell_4", "the local journal", "SN-0001", "signed by two people"] {
         assert!(all.contains(words), "{words}: {all}");
     }
-    assert!(all.contains("signed by A. Smith and B. Jones, due 2027-03-01") && at("regrind.dump").exists(), "{all}");
+    let offer = ["by A. Smith and B. Jones", "2027-03-01"];
+    assert!(all.lines().any(|line| offer.iter().all(|piece| line.contains(piece))), "{all}");
+    assert!(at("regrind.dump").exists(), "{all}");
     let left = said.iter().rev().find(|said| said.contains("SN-0003")).unwrap();
     assert!(
         left.lines().last().unwrap().contains("open") && !left.contains("begun"),

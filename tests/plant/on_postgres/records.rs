@@ -81,7 +81,7 @@ fn run_replicated_verified_and_fetched() {
 
     // The copy is evidence alone, and together with the journal of the cell.
     let both = plant.does(&["audit", "verify", "--plant", "cell-1.toml"]);
-    assert!(both.contains("the local journal contains these records") && both.contains("sound       "), "{both}");
+    assert!(both.contains("local journal") && both.contains("sound       "), "{both}");
     let told: Value =
         serde_json::from_str(&plant.does(&["audit", "verify", "--plant", "cell-1.toml", "--json"])).unwrap();
     assert!(
@@ -91,11 +91,7 @@ fn run_replicated_verified_and_fetched() {
     let copy = ["audit", "verify", &name, "--plant", "owner.toml"];
     fs::rename(plant.path("runs"), plant.path("elsewhere")).unwrap();
     let alone = plant.does(&copy);
-    assert!(
-        alone.contains(&format!("{} records", before.len()))
-            && alone.contains("with a key that is enrolled for cell-1"),
-        "{alone}"
-    );
+    assert!(alone.contains(&format!("{} records", before.len())) && alone.contains("enrolled for cell-1"), "{alone}");
 
     plant.does(&["plant", "fetch", &name, "--plant", "owner.toml", "--out", "back"]);
     let back = plant.path("back").join(&name);
@@ -155,14 +151,15 @@ fn plant_detects_truncated_journal() {
     cut(&folder, all / 2);
 
     let (_, told) = plant.ends(&["ship", "--once", "--plant", "cell-1.toml"], 1);
-    let words = format!("the plant has {all} records, and the journal has {}: its end was cut off", all / 2);
-    assert!(told.contains(&words), "{told}");
+    let pieces = [format!("plant has {all} records"), format!("journal has {}:", all / 2), "cut off".to_owned()];
+    let is_cut = |text: &str| pieces.iter().all(|piece| text.contains(piece));
+    assert!(is_cut(&told), "{told}");
     let (_, told) = plant.ends(&["audit", "verify", "--plant", "cell-1.toml"], 1);
-    assert!(told.contains(&words), "{told}");
+    assert!(is_cut(&told), "{told}");
     let incidents = plant.incidents();
     let last = incidents.last().unwrap();
     assert_eq!((last["by"].as_str(), last["run"].as_str()), (Some("cell-1"), Some(&*name)), "{last}");
-    assert!(last["what"] == "a journal that differs" && last["words"].as_str().unwrap().contains(&words), "{last}");
+    assert!(last["what"] == "a journal that differs" && is_cut(last["words"].as_str().unwrap()), "{last}");
     // The copy of the plant is unchanged, and verifies.
     plant.does(&["plant", "fetch", &name, "--plant", "owner.toml", "--out", "back"]);
     assert_eq!(records(&plant.path("back").join(&name)).len(), all);

@@ -118,7 +118,7 @@ fn cell_account_reads_only_its_own() {
     assert!(plant.postgres.ask_as("cell_2", "wrong", "regrind", "SELECT 1").is_err());
     plant.does(&["plant", "retire", "cell-2", "--plant", "owner.toml"]);
     let (_, told) = plant.ends(&["ship", "--once", "--plant", "cell-2.toml", "--runs", "runs-2"], 2);
-    assert!(told.contains("refused the login of this computer"), "{told}");
+    assert!(told.contains("login") && told.contains("\"cell_2\""), "{told}");
     assert_eq!(plant.sql("SELECT count(*) FROM record"), all.to_string());
 }
 
@@ -166,10 +166,10 @@ fn forged_records_become_incidents() {
     // A valid chain of another run under the name of this one.
     let run_4 = plant.asked_by("cell-1", "SELECT id FROM open_run('another')").unwrap();
     let said = plant.asked_by("cell-1", &ship(&run_4, 1, &another_run)).unwrap();
-    assert!(said.contains("begins another run than another"), "{said}");
+    assert!(said.contains("record 1 ") && said.contains("than another"), "{said}");
     // The other cell appends to a run that is not its own; the answer and the incident show it.
     let said = plant.asked_by("cell-2", &ship(&run, 3, &other[2..])).unwrap();
-    assert!(said.contains("which is none of this cell's"), "{said}");
+    assert!(said.contains(&format!("run {run},")) && said.contains("this cell"), "{said}");
     plant.asked_by("cell-2", "SELECT tell_run(1, '{\"cycles\":[],\"result\":\"accepted\"}')").unwrap();
     assert_eq!(plant.sql("SELECT count(*) FROM incident WHERE what = 'a foreign run'"), "2");
     assert_eq!(plant.sql("SELECT result IS NULL OR result <> 'accepted' FROM run WHERE id = 1"), "t");

@@ -40,7 +40,7 @@ fn study_runs_match_their_seeds() {
     let (code, told, errors) = begin("acceptance.rms_um=0.002,1.0");
     assert!(code == 0 && told.starts_with("limits: 4 jobs"), "{told}{errors}");
     let (code, _, told) = begin("acceptance.rms_um=1.0");
-    assert!(code == 2 && told.contains("a study \"limits\" already exists"), "{told}");
+    assert!(code == 2 && told.contains("\"limits\" already exists"), "{told}");
 
     // One worker dies with a job, whose lease expires faster here.
     let mut dies = Running::new(regrind(&["study", "work", "--plant", "farm-1.toml"], plant.home.path()));

@@ -219,7 +219,10 @@ pub struct ParameterEstimation {
 #[allow(missing_docs)]
 #[non_exhaustive]
 pub enum ParameterError {
-    #[error("{points} points are too few to separate parameters from form; measure at least {MIN_POINTS}")]
+    #[error(
+        "{points} points are too few to separate the machine parameters from the form of the part; measure at least \
+         {MIN_POINTS} points"
+    )]
     TooFew { points: usize },
     #[error(
         "point number {} has a coordinate, normal or deviation that is not a finite number; do not use this \
@@ -241,7 +244,7 @@ pub enum ParameterError {
     WheelRadius { radius_mm: f64 },
     #[error("{what} is {value}; it must be finite and {limit}")]
     Stated { what: &'static str, value: f64, limit: &'static str },
-    #[error("parameters cannot be separated from the form of the part: {0}")]
+    #[error("the machine parameters cannot be separated from the form of the part: {0}")]
     Field(#[from] ModelError),
 }
 

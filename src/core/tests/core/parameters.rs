@@ -85,8 +85,10 @@ fn parameters_recovered_without_form() {
     }
     assert!(found.residual_rms_mm < 1e-5 && found.rms_mm > 1e-3);
     let radius = &estimate_of(&found, ParameterKind::WheelRadius).message;
-    assert!(radius.starts_with("wheel radius: 12.5900 mm instead of 12.5000 mm, off by "), "{radius}");
-    assert!(radius.contains("set compensation.parameters.wheel_radius_um to its tolerance"), "{radius}");
+    let key = ParameterKind::WheelRadius.recipe_key().unwrap();
+    for piece in ["wheel radius: 12.5900 mm", "instead of 12.5000 mm", "off by", key] {
+        assert!(radius.contains(piece), "{piece}: {radius}");
+    }
 }
 
 #[test]
@@ -221,7 +223,11 @@ fn parameters_report_confounding() {
     // A setting error of a round wheel is a shift of the part.
     let free = estimates(&contacts_on(&FreeForm::default(), scatter), [true; 6]);
     let setting = estimate_of(&free, ParameterKind::SettingX);
-    assert_eq!(setting.inseparable_from, ["a shift of the part along x"], "{}", setting.message);
+    assert!(
+        matches!(&setting.inseparable_from[..], [one] if one.contains("shift") && one.ends_with("along x")),
+        "{}",
+        setting.message
+    );
     assert!(!setting.is_offered && setting.value == 0.0);
     // On a sphere a shift is also a tilt.
     let sphere = estimates(&contacts_on(&Sphere { radius_mm: 120.0 }, scatter), FREE_MOTIONS);
@@ -235,7 +241,7 @@ fn parameters_report_confounding() {
     }
     let plane = estimates(&contacts_on(&FreeForm { scale: 0.0 }, scatter), [true; 6]);
     let radius = estimate_of(&plane, ParameterKind::WheelRadius);
-    assert!(radius.message.contains("no effect on a level surface"), "{}", radius.message);
+    assert!(matches!(&radius.inseparable_from[..], [one] if one.contains("level surface")), "{}", radius.message);
     let wear = estimate_of(&plane, ParameterKind::Wear);
     assert!(wear.inseparable_from.iter().any(|a| a.contains("tilt of the part about x")), "{}", wear.message);
     assert!(plane.estimates.iter().all(|p| !p.is_offered && !p.inseparable_from.is_empty()));

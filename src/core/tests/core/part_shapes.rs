@@ -57,7 +57,9 @@ fn register_off_axis_asphere() {
     assert!(error < 2e-4, "{error} mm");
     // The parent is a surface of revolution about the line x = -70.
     let said = weak_direction_words(&found);
-    assert!(said.contains("rotation about z through (-70.0") && said.contains("keeps its start value"), "{said}");
+    let axis = ["rotation about z", "(-70.0"];
+    let is_parent = |words: &str| axis.iter().all(|piece| words.contains(piece));
+    assert!(found.quality.weak_directions.iter().any(|w| w.held && is_parent(&w.words)), "{said}");
     assert!((found.quality.rms_mm / 3e-4 - 1.0).abs() < 0.05, "{}", found.quality.rms_mm);
 }
 
@@ -90,8 +92,9 @@ fn shallow_wave_reports_weak_directions() {
     let error = normal_error_mm(&found.cmm_from_model, &pose(&placement), &shape, [48.0, 38.0]);
     assert!(error < 1e-4, "{error}");
     let said = weak_direction_words(&found);
-    assert!(said.contains("x and y position repeats only to"), "{said}");
-    assert!(found.quality.weak_directions.iter().all(|w| !w.held), "{said}");
+    let weak = &found.quality.weak_directions;
+    assert!(weak.iter().any(|w| w.words.contains("x and y position") && w.sigma_mm.is_some()), "{said}");
+    assert!(weak.iter().all(|w| !w.held), "{said}");
     // What is said of the weak directions is true of them.
     let off = (pose(&placement).inverse() * found.cmm_from_model).log();
     for k in [0, 1] {

@@ -99,8 +99,8 @@ impl LinuxcncGrinder {
                 let (here, there) = (self.folders.local.display(), &self.folders.remote);
                 let errors = self.controller.errors().await?.join("; ");
                 let why = format!(
-                    "the log file {record} of the controller does not appear in {here}: check that {there} is the same \
-                     folder, and that the account of LinuxCNC has the right to write there. {errors}"
+                    "the log file {record}, which the controller writes, does not appear in {here}: check that {there} on \
+                     the computer of the controller is this folder, and that the account of LinuxCNC has the right to write there. {errors}"
                 );
                 return Err(DeviceError::Folder { machine: self.machine(), reason: why });
             }

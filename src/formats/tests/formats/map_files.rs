@@ -110,18 +110,20 @@ fn x3p_subfolder_and_checksums() {
         ("land/bindata/data.bin", &data),
     ];
     assert_eq!(map(parse_x3p(Path::new("m"), &container(&entries))).measured_count(), 6);
-    for (entry, changed, expected) in [
-        (5, vec![1u8; 48], "bindata/data.bin was changed or damaged"),
-        (3, xml.replace("0.5", "0.6").into_bytes(), "main.xml was changed or damaged"),
-    ] {
+    for (entry, changed, expected) in
+        [(5, vec![1u8; 48], "bindata/data.bin"), (3, xml.replace("0.5", "0.6").into_bytes(), "main.xml")]
+    {
         let mut other = entries;
         other[entry].1 = &changed;
-        let told = parse_x3p(Path::new("m"), &container(&other)).unwrap_err().to_string();
-        assert!(told.contains(expected), "{told}");
+        let error = parse_x3p(Path::new("m"), &container(&other)).unwrap_err();
+        assert!(matches!(&error, FormatError::Checksum { entry, .. } if entry.ends_with(expected)), "{error}");
     }
     let two = container(&[("a/main.xml", xml.as_bytes()), ("b/main.xml", xml.as_bytes())]);
+    let error = parse_x3p(Path::new("m"), &two).unwrap_err();
+    let is_about_two = |expected: &str, found: &str| expected.contains("main.xml") && found.starts_with('2');
     assert!(
-        parse_x3p(Path::new("m"), &two).unwrap_err().to_string().contains("expected one main.xml, found `2 of them`")
+        matches!(&error, FormatError::Unexpected { expected, found, .. } if is_about_two(expected, found)),
+        "{error}"
     );
 }
 
@@ -129,31 +131,32 @@ fn x3p_subfolder_and_checksums() {
 fn x3p_refuses_unsupported_content() {
     let xml = main_xml("D", 1.0, "");
     let turned = "<Rotation><r11>0</r11><r12>-1</r12></Rotation></Axes>";
-    for (from, to, expected) in [
-        ("SUR", "PRF", "found `PRF, a profile`"),
-        ("<SizeZ>1", "<SizeZ>2", "expected one layer"),
-        ("</Axes>", turned, "a frame that is not rotated"),
-        ("</Axes>", "<Origin>SE</Origin></Axes>", "expected SW or NW"),
-        ("<Increment>1<", "<Increment>1e-6<", "an increment of 1"),
-        ("<DataType>D</DataType><Increment>1<", "<DataType>Q</DataType><Increment>1<", "expected I, L, F or D"),
-        ("<AxisType>A", "<AxisType>I", "expected A (absolute)"),
-        ("<Increment>1e-3<", "<Increment>0<", "an increment above 0"),
-        ("<Increment>1e-3<", "<Increment>-1e-3<", "an increment above 0"),
-        ("<Offset>0.5<", "<Offset>NaN<", "a finite number"),
-        ("<SizeX>3", "<SizeX>-3", "a whole number"),
-        ("<SizeX>3", "<SizeX>0", "a side of the map is 0"),
-        ("<SizeX>3", "<SizeX>4", "expected 64 bytes for the dimension in main.xml, found `48`"),
-        ("<SizeX>3", "<SizeX>2", "bytes unpacked, more than the limit of 32"),
-        ("<SizeX>3", "<SizeX>4000000000000", "samples of a map"),
-        ("bindata/data.bin", "../data.bin", "an entry of this container"),
-        ("bindata/data.bin", "bindata/none.bin", "no bindata/none.bin"),
-        ("<PointDataLink>", "<None>", "not readable as XML"),
-        ("p:ISO5436_2 ", "!DOCTYPE x [<!ENTITY a \"b\">]><p:ISO5436_2 ", "not readable as XML"),
-        ("ISO5436_2", "other", "the root ISO5436_2"),
-    ] {
+    let cases: &[(&str, &str, &[&str])] = &[
+        ("SUR", "PRF", &["found `PRF, a profile`"]),
+        ("<SizeZ>1", "<SizeZ>2", &["expected one layer"]),
+        ("</Axes>", turned, &["not rotated"]),
+        ("</Axes>", "<Origin>SE</Origin></Axes>", &["expected SW or NW"]),
+        ("<Increment>1<", "<Increment>1e-6<", &["an increment of 1"]),
+        ("<DataType>D</DataType><Increment>1<", "<DataType>Q</DataType><Increment>1<", &["expected I, L, F or D"]),
+        ("<AxisType>A", "<AxisType>I", &["expected A (absolute)"]),
+        ("<Increment>1e-3<", "<Increment>0<", &["an increment above 0"]),
+        ("<Increment>1e-3<", "<Increment>-1e-3<", &["an increment above 0"]),
+        ("<Offset>0.5<", "<Offset>NaN<", &["a finite number"]),
+        ("<SizeX>3", "<SizeX>-3", &["a whole number"]),
+        ("<SizeX>3", "<SizeX>0", &["a side of the map is 0"]),
+        ("<SizeX>3", "<SizeX>4", &["expected 64 bytes", "`48`"]),
+        ("<SizeX>3", "<SizeX>2", &["bytes unpacked", "limit of 32"]),
+        ("<SizeX>3", "<SizeX>4000000000000", &["samples of a map"]),
+        ("bindata/data.bin", "../data.bin", &["of this container"]),
+        ("bindata/data.bin", "bindata/none.bin", &["no bindata/none.bin"]),
+        ("<PointDataLink>", "<None>", &["not readable as XML"]),
+        ("p:ISO5436_2 ", "!DOCTYPE x [<!ENTITY a \"b\">]><p:ISO5436_2 ", &["not readable as XML"]),
+        ("ISO5436_2", "other", &["the root ISO5436_2"]),
+    ];
+    for (from, to, expected) in cases {
         assert!(xml.contains(from), "{from}");
         let told = parsed(&xml.replace(from, to), &[0; 48]).unwrap_err().to_string();
-        assert!(told.contains(expected), "{to}: {told}");
+        assert!(expected.iter().all(|piece| told.contains(piece)), "{to}: {told}");
     }
     assert!(matches!(parsed(&xml, &f64::NAN.to_le_bytes().repeat(6)), Err(FormatError::NoData { .. })));
     let other = parse_x3p(Path::new("m"), &container(&[("other.xml", b"")]));
@@ -204,7 +207,7 @@ fn x3p_write_round_trip() {
     }
     let mut zip = zip::ZipArchive::new(fs::File::open(&path).unwrap()).unwrap();
     let xml = std::io::read_to_string(zip.by_name("main.xml").unwrap()).unwrap();
-    assert!(xml.contains("<Comment>SIMULATION. Error of the part") && xml.contains("<Date>2026-03-01T12:00:00Z<"));
+    assert!(xml.contains("<Comment>SIMULATION") && xml.contains("<Date>2026-03-01T12:00:00Z<"));
     assert_eq!(fs::read_dir(home.path()).unwrap().count(), 2, "no draft is left");
     let mut broken = written.clone();
     broken.values_mm[0] = f64::NAN;
@@ -240,24 +243,25 @@ fn sdf_text_read_and_errors() {
     assert_eq!((read.grid.columns, read.grid.rows, read.grid.spacing_mm), (3, 2, [1.0, 2.0]));
     assert_eq!((read.valid[2], read.measured_count()), (false, 5));
     assert!(is_about(read.heights_mm[1], 2.5e-3) && is_about(read.heights_mm[5], 0.06));
-    for (from, to, expected) in [
-        ("NumPoints = 3", "NumPoints = 4", "expected 8 heights"),
-        ("NumPoints = 3", "NumPoints = 2", "found `more`"),
-        ("NumPoints = 3", "NumPoints = 1e15", "whole number"),
-        ("NumPoints = 3", "NumPoints = 4000000000", "samples of a map"),
-        ("NumPoints = 3", "Points = 3", "expected a line `NumPoints = ...`"),
-        ("Xscale = 1e-3", "Xscale = 0", "metres per step"),
-        ("Zscale = 1e-6", "Zscale = nan", "expected a number, found `nan`"),
-        ("Compression = 0", "Compression = 1", "compressed heights are not read"),
-        ("DataType = 3", "DataType = 9", "data type from 0 to 7"),
-        ("5 6e1", "5 six", "line 15: expected a height or `BAD`, found `six`"),
-        ("1 2.5 BAD", "1e15 2.5 BAD", "sample 1 of row 1"),
-        ("*\r\n1 2.5", "1 2.5", "expected 6 heights"),
-        ("aISO-1.0", "cISO-1.0", "aISO-1.0 or bISO-1.0"),
-    ] {
+    let cases: &[(&str, &str, &[&str])] = &[
+        ("NumPoints = 3", "NumPoints = 4", &["expected 8 heights"]),
+        ("NumPoints = 3", "NumPoints = 2", &["found `more`"]),
+        ("NumPoints = 3", "NumPoints = 1e15", &["whole number"]),
+        ("NumPoints = 3", "NumPoints = 4000000000", &["samples of a map"]),
+        ("NumPoints = 3", "Points = 3", &["expected a line", "`NumPoints"]),
+        ("Xscale = 1e-3", "Xscale = 0", &["metres per step"]),
+        ("Zscale = 1e-6", "Zscale = nan", &["expected a number", "`nan`"]),
+        ("Compression = 0", "Compression = 1", &["compressed heights"]),
+        ("DataType = 3", "DataType = 9", &["data type from 0 to 7"]),
+        ("5 6e1", "5 six", &["line 15", "`BAD`", "`six`"]),
+        ("1 2.5 BAD", "1e15 2.5 BAD", &["sample 1 of row 1"]),
+        ("*\r\n1 2.5", "1 2.5", &["expected 6 heights"]),
+        ("aISO-1.0", "cISO-1.0", &["aISO-1.0 or bISO-1.0"]),
+    ];
+    for (from, to, expected) in cases {
         assert!(SDF.contains(from), "{from}");
         let told = parse_sdf(Path::new("s"), SDF.replacen(from, to, 1).as_bytes()).unwrap_err().to_string();
-        assert!(told.contains(expected), "{to}: {told}");
+        assert!(expected.iter().all(|piece| told.contains(piece)), "{to}: {told}");
     }
 }
 
@@ -335,16 +339,16 @@ fn metropro_read_and_errors() {
         assert!(is_about(*found, waves * wave_mm), "{found}");
     }
     for (at, with, expected) in [
-        (0, &[0x12u8][..], "magic number, format and length"),
-        (5, &[2], "magic number, format and length"),
-        (68, &[0, 3], "expected 24 bytes of phases"),
+        (0, &[0x12u8][..], "magic number"),
+        (5, &[2], "magic number"),
+        (68, &[0, 3], "24 bytes of phases"),
         (68, &[0, 0], "a side of the map is 0"),
         (72, &[0, 0, 0, 0], "no phases"),
-        (63, &[200], "the file is cut"),
-        (60, &[0xff; 4], "the file is cut"),
-        (164, &[0; 4], "interferometric scale factor"),
+        (63, &[200], "the file ends too early"),
+        (60, &[0xff; 4], "the file ends too early"),
+        (164, &[0; 4], "interferometric scale"),
         (168, &[0x7f, 0xc0, 0, 0], "wavelength in metres"),
-        (219, &[7], "phase resolution of 0, 1 or 2"),
+        (219, &[7], "phase resolution"),
         (184, &[0; 4], "no lateral scale"),
     ] {
         let mut bad = good.clone();
