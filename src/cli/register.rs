@@ -242,8 +242,8 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
 }
 
 /// Returns the estimated form error as lines of text for a person. The lines state RMS, PV and PV 99.8 % of the form in
-/// µm with 95 % intervals, the parameters of the Gaussian-process model, and the standard uncertainty of the frame in
-/// µm. They contain a warning if there are too few points to separate the form from the noise.
+/// µm with 95 % intervals, the parameters of the Gaussian-process model, and the standard uncertainty of the position
+/// of the nominal frame in µm. They contain a warning if there are too few points to separate the form from the noise.
 fn form_in_words(form: &Form) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let within =

@@ -260,12 +260,12 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
     Ok(())
 }
 
-/// Ends the assignment of the part `serial` to this cell. If `up` contains a reason, gives the part up: the part is
-/// made again only if a planner queues it again. If `up` is `None`, returns the part to the queue. Returns
-/// `NotInTolerance` if this cell has not started the part.
+/// Ends the assignment of the part `serial` to this cell. If `up` contains a reason, the part is abandoned: it is made
+/// again only if a planner queues it again. If `up` is `None`, the part returns to the queue. If this cell has not
+/// started the part, there is nothing to end, and the result is `NotInTolerance` (only for its exit code).
 ///
-/// Returns an error if the run of the part is active. Without a reason, also returns an error if the run has sent a
-/// command to a machine or has ended.
+/// # Errors
+/// The run of the part is active. Without a reason, also: the run has sent a command to a machine or has ended.
 async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>) -> Result<Outcome, Failure> {
     let link = plant::open(config).await?;
     let begun = StartedPart::all(&link).await?.into_iter().find(|begun| begun.lease.serial == serial);

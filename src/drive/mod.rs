@@ -776,7 +776,8 @@ impl Drive {
     }
 
     /// Adds the points of a running measurement to the preview (preliminary figures for display), and publishes the new
-    /// snapshot. Deletes the preview if the points belong to another job or batch than the current one.
+    /// snapshot. If the points belong to another job or batch than the one that the CMM now measures, they are ignored
+    /// and the preview is deleted. A batch is a part of a measurement that is sent as a plan of its own.
     fn update_preview(&mut self, preliminary: &PreliminaryPoints) {
         let number = self.cell.cycle();
         let asked = BatchId { cycle: number, batch: self.cycles.batch(number) };

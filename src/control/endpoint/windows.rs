@@ -95,7 +95,8 @@ pub(crate) fn is_listening_at(_: &Path) -> bool {
     false
 }
 
-/// Returns an error: on Windows there is no endpoint outside a run folder.
+/// Always returns an error. On Unix, this function exchanges one line with the socket at a path. On Windows, an
+/// endpoint exists only inside a run folder.
 pub(crate) fn exchange_line_at(_: &Path, _: &[u8], _: Duration) -> io::Result<String> {
     Err(io::ErrorKind::NotFound.into())
 }

@@ -37,8 +37,8 @@ impl ThermalExpansion {
     /// Celsius. The points are scaled about their centroid by 1 / [`ThermalExpansion::length_factor`]. Frame: any.
     /// Units: millimetres.
     ///
-    /// If the points are centres of the probe's ball, the scaling also changes their distance from the surface. This
-    /// distance becomes the radius of the ball divided by [`ThermalExpansion::length_factor`]. The expansion of the
+    /// If the points are centres of the probe's ball, the scaling also changes their distance from the surface. The
+    /// caller must then use the radius of the ball divided by [`ThermalExpansion::length_factor`]. The expansion of the
     /// ball itself needs no correction, because the calibration on the reference sphere already contains it.
     pub fn at_reference(&self, points: &[Point], temperature_c: f64) -> Vec<Point> {
         let n = points.len().max(1) as f64;

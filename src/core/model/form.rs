@@ -1311,7 +1311,7 @@ impl FreeMotions {
     /// lock.
     ///
     /// An element is the change of the signed distance of the point from the surface, in mm, for a unit of the motion.
-    /// Rotations are about the centroid, and are scaled to a length in mm.
+    /// A rotation is about the centroid. Its unit is 1 mm of arc at the RMS distance of the points from the centroid.
     pub(super) fn rows(&self, points: impl Iterator<Item = (Point, Vector)>) -> DMatrix<f64> {
         let rows: Vec<[f64; 6]> = points
             .map(|(point, normal)| {

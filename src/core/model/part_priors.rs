@@ -86,8 +86,8 @@ impl PartPriors {
 
 impl PartFit {
     /// Returns the statistics `before` with one more part added. `hyperparameters` are those of the added part. If
-    /// `before` is `None`, returns the statistics of the added part alone. When the statistics already have twenty
-    /// parts, each added part gradually replaces the earlier ones.
+    /// `before` is `None`, returns the statistics of the added part alone. From the twentieth part on, an added part
+    /// always has the weight 1/20, so that the weights of earlier parts decrease.
     pub fn updated(before: Option<Self>, hyperparameters: &Hyperparameters) -> Self {
         let [range_mm, ratio] =
             [hyperparameters.field.range_mm, hyperparameters.noise_sigma_mm / hyperparameters.field.sigma_mm];

@@ -95,13 +95,14 @@ impl HypothesisSet {
         }
     }
 
-    /// Returns the two variance factors for sampling from a field with the given smoothness. A variance factor
-    /// multiplies the variance of the field.
+    /// Returns the two factors by which the variance of a field with the given smoothness is multiplied for sampling.
+    /// `self` is the set of fields.
     ///
     /// The first factor is 1, for samples of the posterior. The second factor is for samples that bound extreme values,
-    /// such as the maximum of the form. For the set `Smooth`, the second factor is [`LOWER_BOUND_VARIANCE_FACTOR`],
-    /// below 1. For the sets `All` and `Rough`, it is above 1: [`UPPER_BOUND_VARIANCE_FACTOR_ROUGH`] if the field is
-    /// rough ([`Smoothness::Exponential`]), otherwise [`UPPER_BOUND_VARIANCE_FACTOR`].
+    /// such as the maximum of the form. The fields of `Smooth` give the lower bound, so the factor is below 1:
+    /// [`LOWER_BOUND_VARIANCE_FACTOR`]. The fields of `All` and `Rough` give the upper bound, so the factor is above 1:
+    /// [`UPPER_BOUND_VARIANCE_FACTOR_ROUGH`] if the field is rough ([`Smoothness::Exponential`]), otherwise
+    /// [`UPPER_BOUND_VARIANCE_FACTOR`].
     fn variance_factors(self, smoothness: Smoothness) -> [f64; 2] {
         match self {
             Self::Smooth => [1.0, LOWER_BOUND_VARIANCE_FACTOR],
