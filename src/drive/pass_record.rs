@@ -212,7 +212,7 @@ mod tests {
             (PassRecord { temperature_c: Some(-327.0), ..record() }, "the temperature is -327 degrees Celsius"),
             (PassRecord { wheel_radius_mm: Some(11.0), ..record() }, "is 11.000 mm, limits 12.375 to 12.625 mm"),
             (PassRecord { duration_s: Some(0.0), ..record() }, "its duration is 0.000 s, minimum 379.440 s"),
-            (PassRecord { idle_share: Some(1.5), ..record() }, "cut nothing is 1.5, limits 0 to 1"),
+            (PassRecord { idle_share: Some(1.5), ..record() }, "is 1.5, limits 0 to 1"),
             (PassRecord { removed_mm3: Some(-2.0), ..record() }, "the removed volume is -2.000 mm³"),
         ];
         for (record, words) in cases {

@@ -126,7 +126,7 @@ fn orders_to_suspended_process_expire() {
     running.signal("STOP");
     let (code, told, errors) = run(&["hold", &path, "--reason", "nobody hears this"], home.path());
     running.signal("CONT");
-    assert!(code == 3 && errors.contains("does not answer"), "{code} {told}{errors}");
+    assert!(code == 3 && errors.contains("did not answer"), "{code} {told}{errors}");
     assert_eq!(run(&["stop", &path], home.path()).0, 0);
     running.end();
     let events = records_with(&folder, "event");
