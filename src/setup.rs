@@ -367,8 +367,8 @@ pub fn nominal_table_format(words: &TableSettings) -> Result<formats::Table, (&'
     table_format(words, ["nominal.columns", "nominal.unit", "nominal.height_unit"])
 }
 
-/// Converts the table settings of the file of points to measure from text into a table format: columns, unit, and unit
-/// of z. `words` are the settings from the recipe.
+/// Parses the recipe settings `words` for the file that lists the points to measure. Returns the table format of the
+/// file: columns, unit, and unit of z.
 ///
 /// # Errors
 /// Returns the recipe key of a setting that is not valid, and the reason.

@@ -303,7 +303,7 @@ catalogue! {
     /// Response of the part with the wrong sign.
     SignFlipped {
         "The part responded to the map with the opposite sign", "Another pass would make the part worse. The cell is held.", ProcessEngineer,
-        ["Check the sign of the map at the grinder: at a positive value, the grinder must leave more material on the part.", "Do not resume before a test pass on a scrap part has shown the right sign.",
+        ["Check the sign of the map at the grinder: at a positive value, the grinder must leave more material on the part.", "Do not resume before a test pass on a scrap part has shown that a positive value of the map leaves more material.",
          "Stop the run."]
     }
     /// Response to a mirrored or turned map.

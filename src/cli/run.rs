@@ -301,7 +301,7 @@ fn others_in_words(others: &KnowledgeOrigin) -> String {
     let [least, most] = [percent(f64::min), percent(f64::max)];
     match others.differ.is_empty() {
         false => format!(
-            "begins with the knowledge from {runs}: assumed difference between the repeatable errors of the machines: {least:.0} to {most:.0} % (RMS), based on {} comparison(s) of machines\n",
+            "begins with the knowledge from {runs}; {least:.0} to {most:.0} % (RMS, by wavelength) of the repeatable error are assumed to be specific to one machine, based on {} comparison(s) of machines\n",
             others.comparisons
         ),
         true => format!(

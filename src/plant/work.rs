@@ -45,7 +45,7 @@ pub struct StartedPart {
 }
 
 impl Lease {
-    /// Leases the part of the queue with the earliest due date, for the duration [`LEASE`]. Considers only parts that
+    /// Leases the queued part with the earliest due date, for the duration [`LEASE`]. Considers only parts that
     /// are free, that this cell may make, and whose recipe is approved. Returns `None` if there is no such part.
     ///
     /// # Errors

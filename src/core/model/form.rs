@@ -1061,14 +1061,16 @@ impl SampledForms {
     /// Returns the figures RMS, PV and PV 99.8 % (PV without the outermost 0.1 % at either end) with their credible
     /// intervals, in mm.
     ///
-    /// The medians and the intervals come from the posterior samples. Other samples can only widen the intervals:
+    /// The medians and the intervals come from the posterior samples (the first set of `self.forms`). Four other sets
+    /// of samples can only widen the intervals:
     ///
-    /// - `least` has the three figures of each of further samples. They can only lower the lower ends.
-    /// - `most` also has the three figures of each of further samples. They can only raise the upper end of RMS.
-    /// - The second set of samples can only raise the upper ends of PV and PV 99.8 %. In this set, the variance of the
-    ///   field is multiplied by the second variance factor ([`HypothesisSet`]).
-    /// - Samples that count the deviations entirely as form, if there are any, can only raise the upper ends of all
-    ///   three.
+    /// - `least` can only lower the lower ends of all three figures. It has one entry [RMS, PV, PV 99.8 %] for each
+    ///   sample.
+    /// - `most` can only raise the upper end of RMS. Its entries are the same, but PV and PV 99.8 % are not used.
+    /// - The second set of `self.forms` can only raise the upper ends of PV and PV 99.8 %. In this set, the variance of
+    ///   the field is multiplied by the second variance factor ([`HypothesisSet`]).
+    /// - `self.all_form` can only raise the upper ends of all three figures. These samples count the deviations
+    ///   entirely as form.
     ///
     /// If the places are measured points and there are fewer than 200, the lower ends are multiplied by
     /// [`FEW_LOW_FACTOR`]. `is_seen` is true if a form was detected. If it is false, the lower ends are 0.

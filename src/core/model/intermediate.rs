@@ -29,9 +29,9 @@ pub(super) struct IntermediateNodes {
 }
 
 impl IntermediateNodes {
-    /// Creates the nodes of a regular grid that lie between the touched `places`. The positions are in the plane of
-    /// projection, in mm. The grid is parallel to the axes u and v of the basis `waves`. Only nodes that touched places
-    /// surround are kept.
+    /// Lays a regular grid over the touched `places`, and keeps only the nodes that have touched places near them on
+    /// all sides. `places` are x and y in the plane of projection, in mm. The grid is parallel to the axes u and v of
+    /// `waves` (the basis functions of the form).
     ///
     /// Returns `None` if no node is kept, or if the bounding rectangle of the places along u and v has no area.
     pub(super) fn new(places: &[[f64; 2]], waves: &Basis) -> Option<Self> {

@@ -551,9 +551,9 @@ fn exclude_off_part(correspondences: &mut [Correspondence]) {
     correspondences.iter_mut().for_each(|t| t.in_fit = !(may_be && t.is_off_part()));
 }
 
-/// Selects at most 24 `features` (places with principal curvatures). They are spread over the half of the list with the
-/// largest difference between the two principal curvatures. With a large difference the principal directions are
-/// certain.
+/// Selects at most 24 of `features` (places with principal curvatures). Sorts them by the difference between their two
+/// principal curvatures, keeps the half with the largest differences (at least 24, if there are so many), and takes
+/// every k-th of these. Where the difference is large, the principal directions are certain.
 fn most_anisotropic(mut features: Vec<CurvatureFeature>) -> Vec<CurvatureFeature> {
     features.sort_by(|a, b| b.anisotropy().total_cmp(&a.anisotropy()));
     features.truncate((features.len() / 2).max(MEASURED_FEATURES));

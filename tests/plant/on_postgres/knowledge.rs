@@ -64,7 +64,7 @@ fn second_cell_starts_from_learned_error() {
 
     states(&plant, "0.1");
     let (second, said) = made(&plant, "cell-2", "2");
-    for piece in ["begins with", &format!("cell-1 (run {taught_by})"), "assumed difference"] {
+    for piece in ["begins with", &format!("cell-1 (run {taught_by})"), "assumed"] {
         assert!(said.contains(piece), "{piece}: {said}");
     }
     let [without, with] = [&alone, &second].map(|run| first_rms_mm(run));
