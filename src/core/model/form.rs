@@ -136,6 +136,9 @@ const FEW_POINTS: usize = 200;
 const FEW_LOW_FACTOR: f64 = 0.75;
 /// Maximum share of the largest variance at which a direction counts as locked.
 const MAX_LOCKED_SHARE: f64 = 1e-13;
+/// Maximum variance of a direction of the twist, as a share of the sum of its terms without their signs, at which the
+/// terms count as cancelled. The direction is then locked.
+const MAX_CANCELLED_SHARE: f64 = 1e-12;
 
 impl Form {
     /// Estimates the form of a part at the measured points, from the deviations of a registered measurement. The form
@@ -704,6 +707,9 @@ fn absorbed_form_factor(observed: &Observations, posterior: &Posterior) -> DMatr
     let rows = &observed.fixed_effects;
     let weights = rows * inverse_of_products(rows);
     let (covered, _) = posterior.mean_covariance(&posterior.fields.sums(&weights));
+    if covered.is_empty() {
+        return covered;
+    }
     let SymmetricEigen { eigenvalues, eigenvectors } = covered.symmetric_eigen();
     eigenvectors * DMatrix::from_diagonal(&eigenvalues.map(|value| value.max(0.0).sqrt()))
 }
@@ -711,6 +717,9 @@ fn absorbed_form_factor(observed: &Observations, posterior: &Posterior) -> DMatr
 /// Returns the inverse of the matrix of products, (H'H)^-1, where H is the matrix `effects`. Returns the pseudo-inverse
 /// if the columns of H are linearly dependent.
 fn inverse_of_products(effects: &DMatrix<f64>) -> DMatrix<f64> {
+    if effects.ncols() == 0 {
+        return DMatrix::zeros(0, 0);
+    }
     let inverse = effects.tr_mul(effects).pseudo_inverse(f64::EPSILON);
     inverse.unwrap_or_else(|_| DMatrix::zeros(effects.ncols(), effects.ncols()))
 }
@@ -719,8 +728,8 @@ fn inverse_of_products(effects: &DMatrix<f64>) -> DMatrix<f64> {
 pub(super) struct SampledForms {
     /// Samples of the posterior, and samples of fields with the second variance factor, which bound the extremes.
     pub(super) forms: [DMatrix<f64>; 2],
-    /// Samples that count the measured deviations entirely as form, with the form that the pose absorbed. None unless the points are too few to separate form
-    /// from noise, and the noise of the probe is unknown.
+    /// Samples that count the measured deviations entirely as form, with the form that the pose absorbed. None unless
+    /// the points are too few to separate form from noise, and the noise of the probe is unknown.
     all_form: Option<DMatrix<f64>>,
     pub(super) places: Vec<[f64; 2]>,
     /// Motions that a best fit removes, at the places.
@@ -864,7 +873,7 @@ impl SampledForms {
     /// uncertain.
     ///
     /// If the points are too few to separate form from noise ([`is_underdetermined`]), another set of samples is
-    /// created. In this set, the deviations count entirely as form.
+    /// created. In this set, the deviations count entirely as form, and the form that the pose absorbed is added.
     fn with_unresolved_form(mut self, observed: &Observations, posterior: &Posterior, inputs: &ModelInputs) -> Self {
         // The residuals also contain motions and random effects. Neither is noise. Between the touches the samples keep
         // all of their motions.
@@ -1332,7 +1341,16 @@ impl FreeMotions {
         let whole = Matrix6::from_fn(|r, c| whole[(r, c)]);
         // The size is positive, so the matrix is invertible.
         let back = motion_about(self.centre, self.size_mm).try_inverse().unwrap_or_else(Matrix6::identity);
-        back * whole * back.transpose()
+        let mut twist = back * whole * back.transpose();
+        // The terms of a locked direction cancel each other. A remainder of rounding can be negative.
+        let terms = back.abs() * whole.abs() * back.abs().transpose();
+        for k in 0..6 {
+            if twist[(k, k)] <= MAX_CANCELLED_SHARE * terms[(k, k)] {
+                twist.row_mut(k).fill(0.0);
+                twist.column_mut(k).fill(0.0);
+            }
+        }
+        twist
     }
 }
 

@@ -564,6 +564,43 @@ fn few_points_upper_bound_covers_form() {
     assert!(held + allowed_misses(2) >= parts, "{held} of {parts}");
 }
 
+/// Checks registrations that leave the pose no free direction, or deviations of exactly 0, or both. The form then has
+/// figures, and the frame has no variance and no value that is not a number.
+#[test]
+fn form_without_free_motions() {
+    const ALL: [Coordinate; 6] =
+        [Coordinate::X, Coordinate::Y, Coordinate::Z, Coordinate::Rx, Coordinate::Ry, Coordinate::Rz];
+    let form = FormError::with_rms(&mut regrind_sim::rng(3), 30.0, 1e-3);
+    let nominal = free_form(109, 69);
+    for counts in [[4, 4], [12, 8]] {
+        let measured = points(&centres(&FreeForm::default(), &form, [[-40.0, -25.0], [40.0, 25.0]], counts));
+        for locks in [&ALL[..], &ALL[1..], &ALL[..1]] {
+            let locked = Coordinate::locked_flags(locks);
+            let options = RegistrationOptions {
+                start: Start::Pose(Pose::identity()),
+                locked,
+                ..RegistrationOptions::new(RADIUS_MM)
+            };
+            let found = register(&nominal, &measured, &options).unwrap();
+            let mut zero = found.clone();
+            zero.deviations.iter_mut().for_each(|deviation| deviation.deviation_mm = 0.0);
+            let mut settled = zero.clone();
+            settled.quality.covariance = Matrix6::zeros();
+            for (is_zero, registration) in [(false, found), (true, zero), (true, settled)] {
+                let form = Form::estimate(&registration, &ModelInputs::default()).unwrap();
+                let FormFigures { rms, pv, pv_998 } = form.figures;
+                for of in [rms, pv, pv_998] {
+                    assert!(0.0 <= of.low_mm && of.low_mm <= of.median_mm && of.median_mm <= of.high_mm, "{of:?}");
+                    assert!(!is_zero || of.high_mm < 1e-12, "{of:?}");
+                }
+                let variances = form.frame_covariance.diagonal();
+                assert!(variances.iter().all(|variance| *variance >= 0.0), "{locks:?}: {variances}");
+                assert!(locks.len() < 6 || variances.iter().all(|variance| *variance == 0.0), "{variances}");
+            }
+        }
+    }
+}
+
 #[test]
 fn figures_independent_of_threads() {
     let form = FormError::with_rms(&mut regrind_sim::rng(7), 30.0, 1e-3);
