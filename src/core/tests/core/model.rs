@@ -588,8 +588,10 @@ fn form_without_free_motions() {
             settled.quality.covariance = Matrix6::zeros();
             for (is_zero, registration) in [(false, found), (true, zero), (true, settled)] {
                 let form = Form::estimate(&registration, &ModelInputs::default()).unwrap();
-                let FormFigures { rms, pv, pv_998 } = form.figures;
-                for of in [rms, pv, pv_998] {
+                let places: Vec<_> = registration.deviations.iter().map(|d| (d.point, d.normal)).collect();
+                let at_places = Form::estimate_at(&registration, &ModelInputs::default(), &places).unwrap();
+                let figures = [form.figures, at_places.figures];
+                for of in figures.iter().flat_map(|FormFigures { rms, pv, pv_998 }| [rms, pv, pv_998]) {
                     assert!(0.0 <= of.low_mm && of.low_mm <= of.median_mm && of.median_mm <= of.high_mm, "{of:?}");
                     assert!(!is_zero || of.high_mm < 1e-12, "{of:?}");
                 }
