@@ -280,7 +280,7 @@ const FORM_PV: &str = "largest deviation minus smallest deviation of the form fr
                        surface, after the best fit of the form, without the noise of the probe";
 const FORM_PV_998: &str = "largest deviation minus smallest deviation of the form from the nominal surface, along the normal of the nominal \
                          surface, after the best fit of the form, without the noise of the probe; over the aperture (the measured points and the \
-                         positions between the points), without the positions with the lowest 0.1 % and the highest 0.1 % of the deviations";
+                         positions between the points); the lowest 0.1 % and the highest 0.1 % are left out, but never a measured point";
 const FORM_RMS: &str = "root mean square of the deviations of the form from the nominal surface, along the normal of the nominal surface, \
                         after the best fit of the form, without the noise of the probe";
 const PV_998: &str = "largest deviation minus smallest deviation along the normal of the surface, without the lowest 0.1 % \

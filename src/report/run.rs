@@ -217,7 +217,7 @@ fn decision_rule(tolerance: &Tolerance) -> String {
         match tolerance.pv_of {
             regrind_cell::PvPoints::All => ", of the measured points",
             regrind_cell::PvPoints::MostPoints =>
-                "; PV 99.8 % is the PV over the aperture (the measured points and the positions between the points), without the positions with the lowest 0.1 % and the highest 0.1 % of the deviations",
+                "; PV 99.8 % is the PV over the aperture (the measured points and the positions between the points). The lowest 0.1 % and the highest 0.1 % are left out, but never a measured point",
         }
     )
 }

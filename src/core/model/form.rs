@@ -418,7 +418,8 @@ impl FittedModel {
             }
         }
         let found = SampledForms {
-            all_form: drawn.all_form.is_some().then(|| forms[0].clone()),
+            all_form: None,
+            absorbed_motions: DMatrix::zeros(0, 0),
             forms,
             places: points.iter().map(|&k| self.all.places[k]).collect(),
             effects: self.all.fixed_effects.select_rows(points),
@@ -731,6 +732,8 @@ pub(super) struct SampledForms {
     /// Samples that count the measured deviations entirely as form, with the form that the pose absorbed. None unless
     /// the points are too few to separate form from noise, and the noise of the probe is unknown.
     all_form: Option<DMatrix<f64>>,
+    /// Motions by which the pose can have followed the form, one column for each sample. They belong to `all_form`.
+    absorbed_motions: DMatrix<f64>,
     pub(super) places: Vec<[f64; 2]>,
     /// Motions that a best fit removes, at the places.
     pub(super) effects: DMatrix<f64>,
@@ -819,6 +822,7 @@ impl SampledForms {
         Self {
             forms,
             all_form: None,
+            absorbed_motions: DMatrix::zeros(0, 0),
             places,
             effects,
             chosen: Vec::new(),
@@ -893,15 +897,13 @@ impl SampledForms {
                 let scatter_mm = self.noise_mm[c];
                 form.iter_mut().zip(found).for_each(|(value, of)| *value = larger * of + scatter_mm * normals.next());
             }
-            // The pose takes most of a wide form away from so few points. The best fit removes only the noise here, so
-            // the form that the pose absorbed is added after it.
-            let mut all = without_best_fit(all, &self.effects);
             let factor = absorbed_form_factor(observed, posterior);
-            for (c, mut form) in all.column_iter_mut().enumerate() {
+            let mut numbers = DMatrix::zeros(factor.ncols(), all.ncols());
+            for (c, mut column) in numbers.column_iter_mut().enumerate() {
                 let mut normals = NormalGenerator::new(9, c as u64);
-                let numbers = DVector::from_fn(factor.ncols(), |_, _| normals.next());
-                form += &self.effects * (&factor * numbers);
+                column.iter_mut().for_each(|value| *value = normals.next());
             }
+            self.absorbed_motions = factor * numbers;
             self.all_form = Some(all);
         }
         let Self { forms, noise_mm: scatter_mm, truncated_mm: narrow_mm, .. } = &mut self;
@@ -1026,6 +1028,11 @@ impl SampledForms {
             taken
         };
         let taken = self.forms.each_mut().map(fit);
+        if let Some(all) = &mut self.all_form {
+            fit(all);
+            // The pose takes most of a wide form away from so few points. This part is added after the best fit.
+            *all += &self.effects * &self.absorbed_motions;
+        }
         if let Some(IntermediateForms { forms, effects, .. }) = &mut self.intermediate {
             for (forms, taken) in forms.iter_mut().zip(&taken) {
                 // The points determine every motion that the registration was free to make, so the factor is

@@ -61,7 +61,7 @@ impl DisplayState {
             Self::Held => "held",
             Self::Alarm => "with an alarm or aborted",
             Self::Still => "without a run",
-            Self::Silent => "not heard of",
+            Self::Silent => "silent",
         }
     }
 
@@ -130,7 +130,7 @@ impl CellSummary {
     fn heard(&self) -> String {
         match self.heard_s {
             None => "no report yet".to_owned(),
-            Some(seconds) if self.is_silent() => format!("not heard of for {}", ago(seconds)),
+            Some(seconds) if self.is_silent() => format!("no report for {}", ago(seconds)),
             Some(seconds) => format!("heard {} ago", ago(seconds)),
         }
     }

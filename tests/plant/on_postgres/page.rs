@@ -190,14 +190,14 @@ fn overview_shows_cells_and_yield() {
     let html = shown.text("/");
     let said = words(&html);
     for piece in [
-        "2 not heard of",
+        "2 silent",
         "1 at work",
         "cell-1 grinding SN-0042",
         "Mirror, cycle 2",
         "6 30 of 100",
         "2 – 4 min left heard",
-        "cell-2 not heard of",
-        "not heard of for 3 h",
+        "cell-2 no report",
+        "no report for 3 h",
         "report: grinding SN-0043",
     ] {
         assert!(said.contains(piece), "{piece}: {said}");
