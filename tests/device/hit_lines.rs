@@ -57,8 +57,8 @@ fn settings(folder: &Path, line: HitSource) -> HitLinesSettings {
     }
 }
 
-fn serial(serving: &ServingHits) -> HitSource {
-    let device = serving.path().unwrap().display().to_string();
+fn serial(port: &Path) -> HitSource {
+    let device = port.display().to_string();
     HitSource::Serial { device, baud: 9600, data_bits: 8, parity: Parity::None, stop_bits: 1 }
 }
 
@@ -93,7 +93,7 @@ impl Bench {
 
     async fn on_serial(targets: u32, change: impl FnOnce(&mut HitLinesSettings)) -> Self {
         let serving = ServingHits::serial().unwrap();
-        let line = serial(&serving);
+        let line = serial(serving.path().unwrap());
         Self::new(targets, serving, line, change).await
     }
 
@@ -270,11 +270,17 @@ async fn unplugged_port_and_stale_input() {
     let serving = ServingHits::serial().unwrap();
     // Possibly of another part.
     serving.send(b"100.000,200.000,300.000\r\n").await;
-    let line = serial(&serving);
+    // A link with a name that no other test uses: the operating system gives the number of a closed pseudo-terminal
+    // to the next one that is opened, also to that of another test.
+    let ports = tempfile::tempdir().unwrap();
+    let port = ports.path().join("port");
+    std::os::unix::fs::symlink(serving.path().unwrap(), &port).unwrap();
+    let line = serial(&port);
     let mut bench = Bench::new(2, serving, line, |_| {}).await;
     bench.serving.send(b"150.000,200.000,300.000\r\n").await;
     bench.until(1, MachineState::Execute).await;
     assert_eq!(bench.cmm.read_ahead(bench.job, &Interrupt::new()).await, None, "the first target is not touched");
+    std::fs::remove_file(&port).unwrap();
     bench.serving = ServingHits::serial().unwrap();
     while bench.cmm.status().await.is_ok() {
         tokio::time::sleep(Duration::from_millis(1)).await;
