@@ -34,7 +34,7 @@ fn sizes() -> Vec<u64> {
 fn path(points: u64) -> ToolPath {
     let grid = Grid { columns: 101, rows: 61, first_mm: [-50.0, -30.0], spacing_mm: [1.0, 1.0] };
     let values_mm = (0..grid.len()).map(|k| error_mm(grid.place_mm(k))).collect();
-    path_of(nominal(), &Correction { grid, values_mm, cycle: 2, level_mm: 0.02, set: None }, points)
+    path_of(nominal(), &Correction { grid, values_mm, cycle: 2, level_mm: 0.02, parameters: None }, points)
 }
 
 /// Returns the error that the grinder left, in millimetres.

@@ -129,7 +129,7 @@ fn main() {
             print!("{held:9.1}{above:6.1}{:8.2}{:4}", width / truth.max(SCATTER_MM / 10.0), "");
         }
         let accepted = |k: usize| {
-            let is = |of: &&[(f64, Interval); 3]| of[k].1.accepted_mm <= of[k].0 / 1.05;
+            let is = |of: &&[(f64, Interval); 3]| of[k].1.acceptance_bound_mm <= of[k].0 / 1.05;
             100.0 * all.iter().filter(is).count() as f64 / all.len() as f64
         };
         println!("{:8.1}{:6.1}", accepted(0), accepted(2));

@@ -233,7 +233,7 @@ fn robustness(nominal: &Nominal, figures: &Path) -> Outcome {
             flat.map_or_else(|e| e.to_string(), |f| in_short(&f)),
         );
         let start = (0.0, objective_mm2(nominal, &measured, DistanceModel::Curved)?);
-        let taken = found.trace.iter().filter(|i| i.taken).zip(1..).map(|(i, k)| (f64::from(k), i.objective_mm2));
+        let taken = found.trace.iter().filter(|i| i.accepted).zip(1..).map(|(i, k)| (f64::from(k), i.objective_mm2));
         series.push(Series {
             name: name.into(),
             points: std::iter::once(start).chain(taken).map(<[f64; 2]>::from).collect(),
@@ -250,7 +250,7 @@ fn robustness(nominal: &Nominal, figures: &Path) -> Outcome {
 }
 
 fn in_short(found: &Registration) -> String {
-    let rises = found.trace.iter().filter(|i| i.taken).map(|i| i.objective_mm2).collect::<Vec<_>>();
+    let rises = found.trace.iter().filter(|i| i.accepted).map(|i| i.objective_mm2).collect::<Vec<_>>();
     let rises = rises.windows(2).filter(|w| w[1] > w[0]).count();
     format!("{:.1e} ({}, {rises})", 1e6 * found.quality.pv_mm, found.quality.iterations)
 }
@@ -477,7 +477,7 @@ fn equivalence(nominal: &Nominal, (measured, after): &(Measurement, Registration
 }
 
 fn steps(found: &Registration) -> String {
-    let steps: Vec<String> = found.trace.iter().map(|i| format!("{:.1e} ({})", i.step, i.taken)).collect();
+    let steps: Vec<String> = found.trace.iter().map(|i| format!("{:.1e} ({})", i.step, i.accepted)).collect();
     if steps.is_empty() { "none to try".into() } else { steps.join(", ") }
 }
 

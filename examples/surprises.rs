@@ -151,7 +151,7 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
         rms_mm: 1e-3 * limits,
         with_uncertainty: true,
         probability: Tolerance::DEFAULT_PROBABILITY,
-        pv_of: PvPoints::MostPoints,
+        pv_points: PvPoints::MostPoints,
     };
     let adaptive = AdaptiveOptions { tolerance, accepted_risk: 0.025, max_cycles: 5 };
     let given = ModelInputs {

@@ -44,7 +44,7 @@ impl CmmSpec {
     fn check_travel(&self, plan: &Plan) -> Result<(), Refusal> {
         let highest = plan.targets.iter().map(|t| t.point_mm[2]).fold(f64::NEG_INFINITY, f64::max);
         let travel_mm = highest + plan.safe_height_mm;
-        let (least, most) = (self.travel_least_mm, self.travel_most_mm);
+        let (least, most) = (self.min_travel_mm, self.max_travel_mm);
         let check = |name: &str, value: f64, axis: usize| {
             if (least[axis]..=most[axis]).contains(&value) {
                 return Ok(());
@@ -306,7 +306,7 @@ impl TouchProbe {
     /// then the maximum x, y, z.
     pub fn volume_mm(&self) -> [Vec3; 2] {
         let spec = &locked(&self.world).spec.cmm;
-        [spec.travel_least_mm, spec.travel_most_mm]
+        [spec.min_travel_mm, spec.max_travel_mm]
     }
 
     /// Returns the speed of travel, in mm/s.
@@ -446,7 +446,7 @@ impl Physics for Cmm {
             run.elapsed_s += seconds;
         }
         state.engaged = Some(Kind::Cmm);
-        let most = state.spec.cmm.unexpected_touches_most;
+        let most = state.spec.cmm.max_unexpected_touches;
         while run.fault == 0 && run.due_s.get(run.records.len()).is_some_and(|due_s| *due_s <= run.elapsed_s) {
             let target = run.plan.targets[run.records.len()];
             let record = run.measure(&state, &target);

@@ -12,10 +12,10 @@ use crate::command::{Answer, CommandFrame, State};
 pub struct LogEntry {
     /// Real time since the machine was made, as the sum of its ticks.
     #[serde(rename = "at_s", serialize_with = "seconds")]
-    pub at: Duration,
+    pub time: Duration,
     /// Kind of the event.
     #[serde(flatten)]
-    pub what: HandshakeEvent,
+    pub event: HandshakeEvent,
 }
 
 /// Kind of an event.
@@ -105,13 +105,13 @@ pub enum HandshakeEvent {
 pub struct BeatStatistics {
     /// Number of beats.
     #[serde(rename = "beats")]
-    pub heard: u32,
+    pub count: u32,
     /// Mean time between beats; 0 for fewer than two.
     #[serde(rename = "mean_beat_s", serialize_with = "seconds")]
-    pub mean: Duration,
+    pub mean_interval: Duration,
     /// Longest time without a beat.
     #[serde(rename = "longest_silence_s", serialize_with = "seconds")]
-    pub longest_silence: Duration,
+    pub max_silence: Duration,
 }
 
 /// Collector of the owner's beats during a job.
@@ -142,7 +142,7 @@ impl BeatMonitor {
     pub(crate) fn statistics(&self, now: Duration) -> BeatStatistics {
         let between = self.last.zip(self.first).map_or(Duration::ZERO, |(last, first)| last - first);
         let mean = between.checked_div(self.count.saturating_sub(1)).unwrap_or_default();
-        BeatStatistics { heard: self.count, mean, longest_silence: self.silence_at(now) }
+        BeatStatistics { count: self.count, mean_interval: mean, max_silence: self.silence_at(now) }
     }
 
     fn silence_at(&self, now: Duration) -> Duration {
@@ -183,7 +183,7 @@ impl EventLog {
             self.entries.drain(..Self::CAPACITY / 2);
             self.forgotten += Self::CAPACITY as u64 / 2;
         }
-        let seen = LogEntry { at, what };
+        let seen = LogEntry { time: at, event: what };
         if let Some(observer) = &mut self.observer {
             observer(&seen);
         }

@@ -114,7 +114,7 @@ struct Run {
     job: u32,
     cycle: u16,
     map_identity: [u8; 32],
-    map_largest_mm: f64,
+    max_map_mm: f64,
     pass: Pass,
     /// Positions along one stroke, in mm, each with the index of the node that is ground there, in order.
     order: Vec<(f64, u32)>,
@@ -391,8 +391,8 @@ impl Grinder {
     /// The feed, the travel or the number of tracks is above its limit.
     fn check_pass(state: &WorldState, pass: &Pass) -> Result<(), Refusal> {
         let spec = &state.spec.grinder;
-        if pass.feed_mm_min > spec.feed_most_mm_min {
-            return Err(outside("feed in mm/min", pass.feed_mm_min, &format!("up to {}", spec.feed_most_mm_min)));
+        if pass.feed_mm_min > spec.max_feed_mm_min {
+            return Err(outside("feed in mm/min", pass.feed_mm_min, &format!("up to {}", spec.max_feed_mm_min)));
         }
         let [x0, x1, y0, y1] = grown(pass.extent_mm);
         for (name, value, most) in [("x", x0.abs().max(x1.abs()), 0), ("y", y0.abs().max(y1.abs()), 1)] {
@@ -409,7 +409,7 @@ impl Grinder {
     }
 
     fn check_map(state: &WorldState, map: &Map) -> Result<(), Refusal> {
-        let most = state.spec.grinder.map_most_um;
+        let most = state.spec.grinder.max_map_um;
         if map.max_abs_mm() * 1e3 > most {
             return Err(outside("largest value of the map in um", map.max_abs_mm() * 1e3, &format!("up to {most}")));
         }
@@ -478,7 +478,7 @@ fn run(
         job,
         cycle,
         map_identity: map_payload.identity,
-        map_largest_mm: map.max_abs_mm(),
+        max_map_mm: map.max_abs_mm(),
         pass,
         order,
         fixed_mm,
@@ -581,7 +581,7 @@ impl Physics for Grinder {
             job: run.job,
             cycle: run.cycle,
             level_mm: run.pass.level_mm,
-            map_max_abs_mm: run.map_largest_mm,
+            map_max_abs_mm: run.max_map_mm,
             map: run.map_identity,
             roughing_strokes: run.roughing(),
             result: 0,

@@ -59,7 +59,7 @@ pub(crate) struct Handshake {
     fault: u16,
     job: JobKey,
     token: u32,
-    token_left: Duration,
+    token_remaining: Duration,
     /// True if a START began a job that has not ended.
     running: bool,
     begun_by: u32,
@@ -105,7 +105,7 @@ impl Handshake {
             fault: 0,
             job: JobKey::default(),
             token: 0,
-            token_left: Duration::ZERO,
+            token_remaining: Duration::ZERO,
             running: false,
             begun_by: 0,
             begun: options.last_begun.into_iter().collect(),
@@ -259,7 +259,7 @@ impl Handshake {
             Command::Prepare => {
                 self.job = JobKey { job: frame.job, cycle: frame.cycle, digest: frame.digest };
                 self.token = self.rng.random_range(1..=u32::MAX);
-                self.token_left = TOKEN_LIFE;
+                self.token_remaining = TOKEN_LIFE;
                 self.enter(State::Prepared);
             }
             Command::Start => self.begin(frame),
@@ -423,11 +423,11 @@ impl Handshake {
     }
 
     fn wait_for_start(&mut self, elapsed: Duration) {
-        self.token_left = self.token_left.saturating_sub(elapsed);
+        self.token_remaining = self.token_remaining.saturating_sub(elapsed);
         if !self.is_safe(interlock::ALL) {
             self.token = 0;
         }
-        if self.token_left.is_zero() {
+        if self.token_remaining.is_zero() {
             self.enter(State::Idle);
         }
     }

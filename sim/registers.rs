@@ -350,7 +350,7 @@ impl SimulatedMachine {
     /// Returns one entry for each job that began, the oldest first: the sequence number of the START command, the
     /// number of the job, and the number of the cycle. Jobs whose events were removed from the log are missing.
     pub fn began(&self) -> Vec<(u32, u32, u16)> {
-        let began = |seen: &LogEntry| match seen.what {
+        let began = |seen: &LogEntry| match seen.event {
             HandshakeEvent::Began { start, job, cycle } => Some((start, job, cycle)),
             _ => None,
         };

@@ -61,9 +61,9 @@ pub struct GrinderSpec {
     /// Travel of the wheel from the middle of the machine in x and y.
     pub travel_mm: [f64; 2],
     /// Maximum feed.
-    pub feed_most_mm_min: f64,
+    pub max_feed_mm_min: f64,
     /// Maximum displacement of a map.
-    pub map_most_um: f64,
+    pub max_map_um: f64,
 }
 
 impl Default for GrinderSpec {
@@ -91,8 +91,8 @@ impl Default for GrinderSpec {
             repeatability_um: 0.4,
             repeatability_correlation_mm: 14.0,
             travel_mm: [250.0, 250.0],
-            feed_most_mm_min: 20_000.0,
-            map_most_um: 500.0,
+            max_feed_mm_min: 20_000.0,
+            max_map_um: 500.0,
         }
     }
 }
@@ -152,15 +152,15 @@ pub struct CmmSpec {
     /// Centre of the reference sphere in the machine's frame.
     pub sphere_centre_mm: Vec3,
     /// Minimum coordinates of the ball's centre.
-    pub travel_least_mm: Vec3,
+    pub min_travel_mm: Vec3,
     /// Maximum coordinates of the ball's centre.
-    pub travel_most_mm: Vec3,
+    pub max_travel_mm: Vec3,
     /// Time for the touch of one point.
     pub seconds_per_point: f64,
     /// Speed of the travel from one point to the next.
     pub travel_mm_s: f64,
     /// Maximum number of touches before the search begins in one measurement.
-    pub unexpected_touches_most: u32,
+    pub max_unexpected_touches: u32,
     /// Points are sent as 32-bit counts of a nanometre (format 2) instead of floats (format 1).
     pub scaled_points: bool,
 }
@@ -181,11 +181,11 @@ impl Default for CmmSpec {
             cte_per_k: 0.55e-6,
             sphere_radius_mm: 12.5,
             sphere_centre_mm: [0.0, 120.0, 20.0],
-            travel_least_mm: [-500.0, -500.0, -300.0],
-            travel_most_mm: [500.0, 500.0, 400.0],
+            min_travel_mm: [-500.0, -500.0, -300.0],
+            max_travel_mm: [500.0, 500.0, 400.0],
             seconds_per_point: 1.0,
             travel_mm_s: 100.0,
-            unexpected_touches_most: 20,
+            max_unexpected_touches: 20,
             scaled_points: false,
         }
     }
@@ -380,8 +380,8 @@ impl WorldSpec {
         check_all("grinder.thermal_tau_s", &[g.thermal_tau_s], 1.0, 1e6, "1 to 1e6 s")?;
         check_all("grinder.error_copying", &[g.error_copying], 0.0, 0.95, "0 to 0.95")?;
         check_all("grinder.travel_mm", &g.travel_mm, 1.0, 1e4, "1 to 10000 mm")?;
-        check_all("grinder.feed_most_mm_min", &[g.feed_most_mm_min], 1.0, 5e4, "1 to 50000 mm/min")?;
-        check_all("grinder.map_most_um", &[g.map_most_um], 0.0, 1e4, SIZE)
+        check_all("grinder.max_feed_mm_min", &[g.max_feed_mm_min], 1.0, 5e4, "1 to 50000 mm/min")?;
+        check_all("grinder.max_map_um", &[g.max_map_um], 0.0, 1e4, SIZE)
     }
 
     fn check_cmm(&self) -> Result<(), SpecError> {
@@ -399,8 +399,8 @@ impl WorldSpec {
         check_all("cmm.cte_per_k", &[c.cte_per_k], -1e-4, 1e-4, "-1e-4 to 1e-4 per kelvin")?;
         check_all("cmm.sphere_radius_mm", &[c.sphere_radius_mm], 0.5, 200.0, "0.5 to 200 mm")?;
         check_all("cmm.sphere_centre_mm", &c.sphere_centre_mm, -2e3, 2e3, "-2000 to 2000 mm")?;
-        check_all("cmm.travel_least_mm", &c.travel_least_mm, -2e3, 2e3, "-2000 to 2000 mm")?;
-        check_all("cmm.travel_most_mm", &c.travel_most_mm, -2e3, 2e3, "-2000 to 2000 mm")?;
+        check_all("cmm.min_travel_mm", &c.min_travel_mm, -2e3, 2e3, "-2000 to 2000 mm")?;
+        check_all("cmm.max_travel_mm", &c.max_travel_mm, -2e3, 2e3, "-2000 to 2000 mm")?;
         check_all("cmm.seconds_per_point", &[c.seconds_per_point], 1e-3, 1e3, "0.001 to 1000 s")?;
         check_all("cmm.travel_mm_s", &[c.travel_mm_s], 0.1, 1e6, "0.1 to 1000000 mm/s")
     }

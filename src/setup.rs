@@ -181,7 +181,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         rehearsal: cell.rehearsal,
     };
     let mut plan = cell_plan(recipe, cell);
-    plan.gates.least_found = min_found_share(recipe);
+    plan.gates.min_found_share = min_found_share(recipe);
     let [map, targets] = [8 * task.first_correction().grid.len(), MAX_TARGET_BYTES * task.targets.len()];
     for (link, bytes) in [(&cell.grinder.link, map), (&cell.cmm.link, targets)] {
         plan.deadlines.transfer = plan.deadlines.transfer.max(transfer_timeout(link, bytes));
@@ -260,7 +260,7 @@ fn tolerance(recipe: &Recipe) -> Tolerance {
         rms_mm: limit(recipe.acceptance.rms_um),
         with_uncertainty: recipe.acceptance.expanded_uncertainty,
         probability: recipe.required_probability(),
-        pv_of: recipe.acceptance.pv_of,
+        pv_points: recipe.acceptance.pv_of,
     }
 }
 
@@ -784,14 +784,14 @@ fn cell_plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
         on_divergence: recipe.cycle.on_divergence,
         on_refusal: HoldOrStop::Stop,
         gates: GateLimits {
-            least_found: recipe.measure.min_coverage,
+            min_found_share: recipe.measure.min_coverage,
             min_coverage: recipe.registration.min_coverage,
-            most_shift_mm: recipe.registration.max_shift_mm,
-            most_turn_rad: recipe.registration.max_turn_deg.to_radians(),
-            most_radius_error_mm: recipe.measure.qualify.then_some(recipe.measure.radius_tolerance_um.mm()),
+            max_shift_mm: recipe.registration.max_shift_mm,
+            max_rotation_rad: recipe.registration.max_turn_deg.to_radians(),
+            max_radius_error_mm: recipe.measure.qualify.then_some(recipe.measure.radius_tolerance_um.mm()),
         },
         removal_budget_mm: recipe.compensation.removal_budget_um.mm(),
-        least_depth_mm: recipe.compensation.min_depth_um.mm(),
+        min_depth_mm: recipe.compensation.min_depth_um.mm(),
         clear_at_start: cell.simulated,
         deadlines,
     }

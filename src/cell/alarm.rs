@@ -8,13 +8,15 @@ pub struct Alarm {
     /// Kind of the alarm.
     pub id: AlarmId,
     /// Event, with the values of this case.
-    pub what: String,
+    #[serde(rename = "what")]
+    pub event: String,
     /// Consequence of the event.
     pub consequence: String,
     /// Steps to take, in this order.
     pub remedy: Vec<String>,
     /// Role that may clear the alarm.
-    pub clears: Role,
+    #[serde(rename = "clears")]
+    pub cleared_by: Role,
 }
 
 /// Role that may clear an alarm.
@@ -414,6 +416,6 @@ impl Alarm {
             case => format!("{head}: {case}."),
         };
         let remedy = remedy.iter().map(|line| (*line).to_owned()).collect();
-        Self { id, what, consequence: consequence.to_owned(), remedy, clears }
+        Self { id, event: what, consequence: consequence.to_owned(), remedy, cleared_by: clears }
     }
 }

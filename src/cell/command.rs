@@ -61,7 +61,12 @@ pub enum Command {
     /// Withdraw an alarm. No answer.
     Withdraw { alarm: AlarmId },
     /// Report that an event did not fit in this state, and why, to the person who sent it. No answer.
-    Refuse { event: Box<Event>, state: State, why: String },
+    Refuse {
+        event: Box<Event>,
+        state: State,
+        #[serde(rename = "why")]
+        reason: String,
+    },
     /// End the run: the last command. No answer.
     Finish(Ending),
 }

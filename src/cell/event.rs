@@ -51,16 +51,34 @@ pub enum Event {
     // Facts from machines.
     /// The machine is the right one, its signature is valid and this program owns it. Answers `Connect` and
     /// `ClearMachine`.
-    Connected { device: Device, boot_id: u32, simulated: bool, found: Occupation },
+    Connected {
+        device: Device,
+        boot_id: u32,
+        simulated: bool,
+        #[serde(rename = "found")]
+        occupation: Occupation,
+    },
     /// The machine cannot be used. Answers `Connect`.
-    NotConnected { device: Device, why: ConnectionRefusal },
+    NotConnected {
+        device: Device,
+        #[serde(rename = "why")]
+        reason: ConnectionRefusal,
+    },
     /// The machine cannot be reached, or its application does not run.
-    LinkLost { device: Device, why: String },
+    LinkLost {
+        device: Device,
+        #[serde(rename = "why")]
+        reason: String,
+    },
     /// The link is open again; the signature and the synchronisation are verified.
     LinkBack { device: Device, boot_id: u32 },
     /// The task of this program that communicates with the machine has failed. No more requests reach the machine,
     /// which holds by its own silence limit.
-    StationFailed { device: Device, why: String },
+    StationFailed {
+        device: Device,
+        #[serde(rename = "why")]
+        reason: String,
+    },
     /// A condition that the cell needs from outside is missing. Reported as a level: again after every reconnection.
     ConditionLost {
         device: Device,
@@ -87,11 +105,20 @@ pub enum Event {
     Prepared { device: Device, cycle: u32 },
     /// The machine has reported the job of this run before. Now it reports no job or another job, and no end of the
     /// job.
-    JobVanished { device: Device, why: String },
+    JobVanished {
+        device: Device,
+        #[serde(rename = "why")]
+        reason: String,
+    },
     /// The machine has accepted START. Answers `StartMachine`.
     Started { device: Device, cycle: u32 },
     /// It is not known whether the machine has accepted START. Answers `StartMachine`.
-    StartUnknown { device: Device, cycle: u32, why: String },
+    StartUnknown {
+        device: Device,
+        cycle: u32,
+        #[serde(rename = "why")]
+        reason: String,
+    },
     /// The job makes progress: `done` of `total` points, or thousandths of the path. A machine that moves without a job
     /// also sends it.
     Progressed { device: Device, done: u32, total: u32 },
@@ -103,7 +130,11 @@ pub enum Event {
     /// The job is over. For the grinder the pass record has been read. Also answers `StopMachine`, even if no job ran.
     Ended { device: Device, cycle: u32, result: JobResult },
     /// The pass record of the grinder is implausible, or belongs to another pass. Comes before `Ended` or `Reconciled`.
-    RecordDoubted { cycle: u32, why: String },
+    RecordDoubted {
+        cycle: u32,
+        #[serde(rename = "why")]
+        reason: String,
+    },
     /// A fresh status shows that the machine is clear of the part. Answers `VerifyClear`.
     Cleared { device: Device },
     /// A fresh status shows that the machine is not clear of the part. Answers `VerifyClear`, or comes without a
@@ -116,7 +147,13 @@ pub enum Event {
     /// The machine is at rest, but no signal shows whether it is clear of the part. Answers `VerifyClear`.
     ClearUnknown { device: Device },
     /// The machine refused the request.
-    Refused { device: Device, what: MachineRequest, why: String },
+    Refused {
+        device: Device,
+        #[serde(rename = "what")]
+        request: MachineRequest,
+        #[serde(rename = "why")]
+        reason: String,
+    },
     /// The machine is in FAULTED. (A machine that held because the link was silent is `MachineHeld`.)
     Fault {
         device: Device,
@@ -144,22 +181,40 @@ pub enum Event {
     /// The measurement is registered. Answers `Register`.
     Registered { cycle: u32, figures: Figures },
     /// The measurement could not be registered. Answers `Register`.
-    RegistrationFailed { cycle: u32, why: String },
+    RegistrationFailed {
+        cycle: u32,
+        #[serde(rename = "why")]
+        reason: String,
+    },
     /// The next map is computed and stored. Answers `Compensate`.
     Compensated { cycle: u32, summary: CompensationSummary },
     /// There is no next map. Answers `Compensate`.
-    CompensationRefused { cycle: u32, why: CompensationRefusal },
+    CompensationRefused {
+        cycle: u32,
+        #[serde(rename = "why")]
+        reason: CompensationRefusal,
+    },
 
     /// The result of a computation cannot be written to the disk. The cell does not use a result before it is written.
     /// Answers `Collect`, `Register` and `Compensate`.
-    NotSaved { cycle: u32, why: RecordFailure },
+    NotSaved {
+        cycle: u32,
+        #[serde(rename = "why")]
+        reason: RecordFailure,
+    },
 
     /// The journal or the run folder cannot be written: no motion may begin.
-    RecordFailed { why: RecordFailure },
+    RecordFailed {
+        #[serde(rename = "why")]
+        reason: RecordFailure,
+    },
     /// A command that expects an answer was not sent, because it could not be recorded.
     NotOnRecord { command: String },
     /// The channel for orders is lost: the sender of an order may not find the cell.
-    ControlLost { why: String },
+    ControlLost {
+        #[serde(rename = "why")]
+        reason: String,
+    },
     /// The channel for orders is back.
     ControlBack,
     /// Time has passed. If the deadline of the cell is reached, the cell reacts to it.
@@ -305,8 +360,8 @@ pub struct Figures {
     #[serde(with = "super::number")]
     pub pv_mm: f64,
     /// Peak to valley of all deviations but the outermost 0.2 %. `None` if it was not computed.
-    #[serde(default, with = "super::number::optional")]
-    pub pv_robust_mm: Option<f64>,
+    #[serde(rename = "pv_robust_mm", default, with = "super::number::optional")]
+    pub pv_998_mm: Option<f64>,
     /// Root mean square of the deviations.
     #[serde(with = "super::number")]
     pub rms_mm: f64,
@@ -329,14 +384,14 @@ pub struct Figures {
     pub outliers: u32,
     /// Figures with the outliers included, and the places of the outliers. `None` if there are no outliers, and in
     /// records of earlier versions.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub left_out: Option<Box<OutlierFigures>>,
+    #[serde(rename = "left_out", default, skip_serializing_if = "Option::is_none")]
+    pub with_outliers: Option<Box<OutlierFigures>>,
     /// Distance of the part from its expected place.
     #[serde(with = "super::number")]
     pub shift_mm: f64,
     /// Angle of the part from its expected orientation.
-    #[serde(with = "super::number")]
-    pub turn_rad: f64,
+    #[serde(rename = "turn_rad", with = "super::number")]
+    pub rotation_rad: f64,
     /// Directions of the pose that the surface determines weakly, in words.
     pub weak_directions: Vec<String>,
     /// Other warnings for a person.
@@ -355,8 +410,8 @@ pub struct Figures {
     pub unstated: Option<[u32; 2]>,
     /// Further targets that the measurement requires before the cell decides. `None` if no further targets are
     /// required.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub touch_on: Option<Box<FurtherTouches>>,
+    #[serde(rename = "touch_on", default, skip_serializing_if = "Option::is_none")]
+    pub further_touches: Option<Box<FurtherTouches>>,
 }
 
 /// Figures with the outliers included.
@@ -369,19 +424,22 @@ pub struct OutlierFigures {
     #[serde(with = "super::number")]
     pub rms_mm: f64,
     /// Outliers: which points, where they are and how large their deviations are, in words.
-    pub places: String,
+    #[serde(rename = "places")]
+    pub description: String,
     /// True if only the outliers can be touched again. If false, the whole part is measured again.
-    #[serde(default)]
-    pub again: bool,
+    #[serde(rename = "again", default)]
+    pub can_repeat: bool,
 }
 
 /// Further points to touch.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FurtherTouches {
     /// Number of targets to touch next.
-    pub targets: u32,
+    #[serde(rename = "targets")]
+    pub target_count: u32,
     /// Reason, in words.
-    pub why: String,
+    #[serde(rename = "why")]
+    pub reason: String,
 }
 
 /// Figures of the form of a part.
@@ -391,12 +449,13 @@ pub struct RecordedFormFigures {
     pub pv: RecordedInterval,
     /// Peak to valley over the aperture: at the touched points and between them, without the outermost 0.1 % at each
     /// end.
-    pub pv_robust: RecordedInterval,
+    #[serde(rename = "pv_robust")]
+    pub pv_998: RecordedInterval,
     /// Root mean square.
     pub rms: RecordedInterval,
     /// Standard deviation of the noise of a single point.
-    #[serde(with = "super::number")]
-    pub scatter_mm: f64,
+    #[serde(rename = "scatter_mm", with = "super::number")]
+    pub noise_sigma_mm: f64,
 }
 
 /// Expected result of another pass.
@@ -437,8 +496,8 @@ pub enum PartResponse {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CompensationSummary {
     /// Largest absolute value of the map.
-    #[serde(with = "super::number")]
-    pub largest_mm: f64,
+    #[serde(rename = "largest_mm", with = "super::number")]
+    pub max_correction_mm: f64,
     /// Maximum removal of the next pass at any place.
     #[serde(with = "super::number")]
     pub depth_mm: f64,
@@ -456,8 +515,8 @@ pub struct CompensationSummary {
     #[serde(default, with = "super::number::pairs")]
     pub gains: Vec<[f64; 2]>,
     /// Response of the part: change of the part as a share of the commanded correction.
-    #[serde(default, with = "super::number")]
-    pub response: f64,
+    #[serde(rename = "response", default, with = "super::number")]
+    pub responded_share: f64,
     /// Other warnings for a person.
     pub warnings: Vec<String>,
     /// Parameters of the machine that the recipe compensates in addition to the map, as far as they are estimated.
@@ -468,8 +527,8 @@ pub struct CompensationSummary {
     pub map_rms_mm: Option<f64>,
     /// Questions to a person before the next pass: one for each parameter whose correction exceeds the tolerance of the
     /// recipe.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub asks: Vec<String>,
+    #[serde(rename = "asks", default, skip_serializing_if = "Vec::is_empty")]
+    pub confirmations_required: Vec<String>,
 }
 
 /// Estimate of a parameter of the machine from a measurement, and its compensation.
@@ -480,15 +539,20 @@ pub struct RecordedParameter {
     /// Unit of all its values.
     pub unit: String,
     /// Estimated error of the parameter, in addition to the correction that the pass already had.
-    pub off: f64,
+    #[serde(rename = "off")]
+    pub estimate: f64,
     /// Expanded uncertainty of the estimate (k = 2).
-    pub expanded: f64,
+    #[serde(rename = "expanded")]
+    pub expanded_uncertainty: f64,
     /// Part of the error that is compensated.
-    pub taken: f64,
+    #[serde(rename = "taken")]
+    pub compensated: f64,
     /// Total correction that the next pass gets, relative to the value of the recipe.
-    pub told: f64,
+    #[serde(rename = "told")]
+    pub total_correction: f64,
     /// Reduction of the root mean square by the compensation, in micrometres.
-    pub removes_rms_um: f64,
+    #[serde(rename = "removes_rms_um")]
+    pub rms_reduction_um: f64,
 }
 
 impl RecordedParameter {
@@ -496,7 +560,15 @@ impl RecordedParameter {
     /// much of the error is compensated. If nothing is compensated, the sentence says that the error is not
     /// significant.
     pub fn in_words(&self) -> String {
-        let Self { name, unit, off, expanded, taken, told, removes_rms_um } = self;
+        let Self {
+            name,
+            unit,
+            estimate: off,
+            expanded_uncertainty: expanded,
+            compensated: taken,
+            total_correction: told,
+            rms_reduction_um: removes_rms_um,
+        } = self;
         let found = format!("{name}: error {off:.2} \u{b1} {expanded:.2} {unit}");
         if *taken == 0.0 && *told == 0.0 {
             return format!(

@@ -26,14 +26,14 @@ impl Figures {
             self.rms_expanded_mm,
             self.coverage,
             self.shift_mm,
-            self.turn_rad,
-            self.pv_robust_mm.unwrap_or(0.0),
+            self.rotation_rad,
+            self.pv_998_mm.unwrap_or(0.0),
             self.forecast.map_or(0.0, |f| f.rms_mm + f.sigma_mm + f.floor_mm.unwrap_or(0.0)),
             self.removed_mm.unwrap_or(0.0),
-            self.left_out.as_ref().map_or(0.0, |of| of.pv_mm),
-            self.left_out.as_ref().map_or(0.0, |of| of.rms_mm),
+            self.with_outliers.as_ref().map_or(0.0, |of| of.pv_mm),
+            self.with_outliers.as_ref().map_or(0.0, |of| of.rms_mm),
         ];
-        let form = self.form.iter().flat_map(|form| [form.pv, form.pv_robust, form.rms]);
+        let form = self.form.iter().flat_map(|form| [form.pv, form.pv_998, form.rms]);
         all.iter().all(|figure| figure.is_finite() && *figure >= 0.0) && form.into_iter().all(|of| of.is_valid())
     }
 
@@ -46,10 +46,10 @@ impl Figures {
     /// points.
     fn judged_intervals(&self, pv_of: PvPoints) -> ([RecordedInterval; 2], bool) {
         match &self.form {
-            Some(form) if pv_of == PvPoints::MostPoints => ([form.pv_robust, form.rms], true),
+            Some(form) if pv_of == PvPoints::MostPoints => ([form.pv_998, form.rms], true),
             Some(form) => ([form.pv, form.rms], false),
             None => {
-                let robust = self.pv_robust_mm.filter(|_| pv_of == PvPoints::MostPoints);
+                let robust = self.pv_998_mm.filter(|_| pv_of == PvPoints::MostPoints);
                 let pv = RecordedInterval::from_expanded(robust.unwrap_or(self.pv_mm), self.pv_expanded_mm);
                 ([pv, RecordedInterval::from_expanded(self.rms_mm, self.rms_expanded_mm)], robust.is_some())
             }
@@ -97,7 +97,7 @@ pub struct ComparedFigure {
     pub limit_mm: f64,
     /// Probability that the figure is within its limit, 0.001 to 0.999. Given even if the tolerance ignores the
     /// uncertainty. `None` if the figure is not limited.
-    pub probability_within: Option<f64>,
+    pub probability_in_tolerance: Option<f64>,
     /// Lower and upper value that are compared with the limit: the quantiles at 1 - p and p, where p is the probability
     /// of the tolerance. If the tolerance ignores the uncertainty, both values are the median.
     pub compared_mm: [f64; 2],
@@ -111,7 +111,7 @@ impl ComparedFigure {
     pub fn probability_in_words(&self) -> Option<String> {
         let [least, most] =
             [RecordedInterval::PROBABILITIES[0], RecordedInterval::PROBABILITIES[RecordedInterval::COUNT - 1]];
-        self.probability_within.map(|within| match within {
+        self.probability_in_tolerance.map(|within| match within {
             _ if within <= least => format!("P(in tolerance) < {}", format_percent(least)),
             _ if within >= most => format!("P(in tolerance) > {}", format_percent(most)),
             _ => format!("P(in tolerance) = {}", format_percent(within)),
@@ -130,7 +130,7 @@ impl Tolerance {
     /// result for the PV and one for the RMS, in this order. The field `pv_of` of the tolerance selects the PV: PV 99.8
     /// % or the PV of all points.
     pub fn compare(&self, figures: &Figures) -> [ComparedFigure; 2] {
-        let ([pv, rms], is_robust) = figures.judged_intervals(self.pv_of);
+        let ([pv, rms], is_robust) = figures.judged_intervals(self.pv_points);
         let compared = |name, of: RecordedInterval, limit_mm: f64| {
             let between_mm = [of.low_mm, of.high_mm];
             let held_mm = match self.with_uncertainty {
@@ -145,7 +145,7 @@ impl Tolerance {
                 expanded_mm,
                 interval_mm: between_mm,
                 limit_mm,
-                probability_within: within,
+                probability_in_tolerance: within,
                 compared_mm: held_mm,
                 conformity,
             }
@@ -166,7 +166,7 @@ impl Tolerance {
     /// of the measured points. The RMS is estimated in the same way, with squares: the outliers increase the square of
     /// the judged RMS by as much as the square of the RMS of the measured points. An increase is never negative.
     fn exceeded_with_outliers(&self, now: &Figures) -> Option<String> {
-        let left_out = now.left_out.as_ref()?;
+        let left_out = now.with_outliers.as_ref()?;
         let [pv, rms] = self.compare(now);
         let more = |with_mm: f64, without_mm: f64| (with_mm - without_mm).max(0.0);
         let pv_mm = pv.median_mm + more(left_out.pv_mm, now.pv_mm);
@@ -177,7 +177,7 @@ impl Tolerance {
             .filter(|(_, with_mm, limit_mm)| with_mm > limit_mm)
             .map(|(name, with_mm, limit_mm)| format!("{name} {}, limit {}", format_um(with_mm), format_um(limit_mm)))
             .collect();
-        (!beyond.is_empty()).then(|| format!("{}; with the outliers: {}", left_out.places, beyond.join("; ")))
+        (!beyond.is_empty()).then(|| format!("{}; with the outliers: {}", left_out.description, beyond.join("; ")))
     }
 }
 
@@ -206,7 +206,7 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
         }
         return tell(Verdict::Accept, format!("in tolerance: {figures}"));
     }
-    let spent = now.removed_mm.filter(|removed| removed + plan.least_depth_mm > plan.removal_budget_mm);
+    let spent = now.removed_mm.filter(|removed| removed + plan.min_depth_mm > plan.removal_budget_mm);
     if let Some(removed) = spent {
         let (removed, budget) = (format_um(removed), format_um(plan.removal_budget_mm));
         return tell(

@@ -32,7 +32,8 @@ pub struct CellPlan {
     /// Maximum removal at any place in the whole run.
     pub removal_budget_mm: f64,
     /// Minimum removal of a pass at any place.
-    pub least_depth_mm: f64,
+    #[serde(rename = "least_depth_mm")]
+    pub min_depth_mm: f64,
     /// True if a machine that is aborted or faulted at the start is cleared without asking a person.
     pub clear_at_start: bool,
     /// Time limits.
@@ -66,7 +67,8 @@ pub struct Tolerance {
     #[serde(default = "Tolerance::usual", skip_serializing_if = "Tolerance::is_usual")]
     pub probability: f64,
     /// Points from which the peak to valley is taken.
-    pub pv_of: PvPoints,
+    #[serde(rename = "pv_of")]
+    pub pv_points: PvPoints,
 }
 
 impl Tolerance {
@@ -111,16 +113,20 @@ pub enum HoldOrStop {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct GateLimits {
     /// Minimum share of the planned points that must be found, 0 to 1.
-    pub least_found: f64,
+    #[serde(rename = "least_found")]
+    pub min_found_share: f64,
     /// Minimum share of the aperture that must be covered, 0 to 1.
     #[serde(rename = "least_coverage")]
     pub min_coverage: f64,
     /// Maximum shift of the part from its expected place.
-    pub most_shift_mm: f64,
+    #[serde(rename = "most_shift_mm")]
+    pub max_shift_mm: f64,
     /// Maximum turn of the part from its expected orientation.
-    pub most_turn_rad: f64,
+    #[serde(rename = "most_turn_rad")]
+    pub max_rotation_rad: f64,
     /// Maximum error of the radius of the probe; `None` if there is no reference sphere.
-    pub most_radius_error_mm: Option<f64>,
+    #[serde(rename = "most_radius_error_mm")]
+    pub max_radius_error_mm: Option<f64>,
 }
 
 /// Time limits.
@@ -143,11 +149,11 @@ pub struct Deadlines {
     pub progress_notice: [Option<Duration>; 2],
     /// Maximum duration of a series of failures without progress, from its first failure. After this time the cell is
     /// held.
-    #[serde(default = "Deadlines::vain")]
-    pub vain: Duration,
+    #[serde(rename = "vain", default = "Deadlines::vain")]
+    pub recurring_failure_time: Duration,
     /// Number of failures in a row, without progress, after which the cell is held.
-    #[serde(default = "Deadlines::vain_failures")]
-    pub vain_failures: u32,
+    #[serde(rename = "vain_failures", default = "Deadlines::vain_failures")]
+    pub max_recurring_failures: u32,
     /// Time from HOLD to the safe position of each machine: CMM, grinder.
     pub hold: [Duration; 2],
     /// Time from STOP to the end of the job of each machine: CMM, grinder.
@@ -183,8 +189,8 @@ impl Default for Deadlines {
             answer: s(10),
             progress: [s(60); 2],
             progress_notice: [Some(s(30)); 2],
-            vain: Self::vain(),
-            vain_failures: Self::vain_failures(),
+            recurring_failure_time: Self::vain(),
+            max_recurring_failures: Self::vain_failures(),
             hold: [s(30); 2],
             stop: [s(60); 2],
             abort: s(2),

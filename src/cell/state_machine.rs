@@ -27,7 +27,7 @@ impl Cell {
         if let Err(why) = self.apply_event(now, &event) {
             let (event, state) = (Box::new(event), self.state);
             let why = why.unwrap_or_else(|| format!("{} is not accepted in the state {state}", event.in_words()));
-            self.commands.push(Command::Refuse { event, state, why });
+            self.commands.push(Command::Refuse { event, state, reason: why });
         }
         std::mem::take(&mut self.commands)
     }
@@ -145,22 +145,22 @@ impl Cell {
             (_, Event::Restarted { actor }) => self.on_restarted(&actor.to_string()),
 
             // Failures of the record, and conditions outside.
-            (_, Event::RecordFailed { why }) => self.on_record_failed(why),
-            (Execute(phase), Event::LinkLost { device, why }) => self.on_link_lost(phase, *device, why, Suspended),
+            (_, Event::RecordFailed { reason: why }) => self.on_record_failed(why),
+            (Execute(phase), Event::LinkLost { device, reason: why }) => self.on_link_lost(phase, *device, why, Suspended),
             (
                 Unholding(phase) | Unsuspending(phase) | Suspending(phase) | Suspended(phase),
-                Event::LinkLost { device, why },
+                Event::LinkLost { device, reason: why },
             ) => {
                 self.on_link_lost(phase, *device, why, Suspended);
             }
-            (Holding(phase) | Held(phase), Event::LinkLost { device, why }) => {
+            (Holding(phase) | Held(phase), Event::LinkLost { device, reason: why }) => {
                 self.on_link_lost(phase, *device, why, Held)
             }
-            (_, Event::LinkLost { device, why }) => {
+            (_, Event::LinkLost { device, reason: why }) => {
                 self.set_link_lost(*device, true);
                 self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
             }
-            (_, Event::StationFailed { device, why }) => self.on_station_failed(*device, why),
+            (_, Event::StationFailed { device, reason: why }) => self.on_station_failed(*device, why),
             (_, Event::LinkBack { device, boot_id }) => self.on_link_back(*device, *boot_id),
             (Execute(phase), Event::ConditionLost { device, condition, message }) => {
                 self.on_condition_lost(*device, *condition, message);
@@ -183,19 +183,19 @@ impl Cell {
             // The result stays at the machine, which gets the acknowledgement in the next run.
             (Stopping, Event::NotOnRecord { command }) if command.starts_with("acknowledge") => self.finish_stopped(),
             (_, Event::NotOnRecord { .. }) => {}
-            (_, Event::ControlLost { why }) => self.raise(AlarmId::ControlLost, why),
+            (_, Event::ControlLost { reason: why }) => self.raise(AlarmId::ControlLost, why),
             (_, Event::ControlBack) => self.withdraw(AlarmId::ControlLost),
 
             (_, Event::NotAutomatic { device, message }) => self.on_manual_mode(*device, message),
             (_, Event::AutomaticAgain { device }) => self.on_automatic_mode(*device),
 
             // Connecting.
-            (Starting, Event::Connected { device, boot_id, found, .. }) => self.on_connected(*device, *boot_id, found),
-            (Held(phase) | Holding(phase), Event::Connected { device, boot_id, found, .. }) => {
+            (Starting, Event::Connected { device, boot_id, occupation: found, .. }) => self.on_connected(*device, *boot_id, found),
+            (Held(phase) | Holding(phase), Event::Connected { device, boot_id, occupation: found, .. }) => {
                 self.on_reconnected(phase, *device, *boot_id, found);
             }
-            (Starting | Held(_) | Holding(_), Event::NotConnected { device, why }) => self.on_not_connected(*device, why),
-            (Starting, Event::Refused { device, what: MachineRequest::Clear, why }) => {
+            (Starting | Held(_) | Holding(_), Event::NotConnected { device, reason: why }) => self.on_not_connected(*device, why),
+            (Starting, Event::Refused { device, request: MachineRequest::Clear, reason: why }) => {
                 self.raise(AlarmId::NotIdle, &format!("{device}, {why}"));
                 self.stop(&format!("the {device} did not clear its old job or fault: {why}"), false);
             }
@@ -239,7 +239,7 @@ impl Cell {
             {
                 self.reconcile(*device);
             }
-            (state, Event::JobVanished { device, why }) if state.phase() == Some(Phase::from_job(*device, JobStep::Run)) => {
+            (state, Event::JobVanished { device, reason: why }) if state.phase() == Some(Phase::from_job(*device, JobStep::Run)) => {
                 self.on_job_vanished(*device, why);
             }
             // The cell already asks the machine, or knows the end of the job.
@@ -264,11 +264,11 @@ impl Cell {
             (state, Event::Ended { device, result, .. }) if running_device(state) == Some(*device) => {
                 self.on_ended(*device, *result)
             }
-            (state, Event::RecordDoubted { why, .. }) if running_device(state) == Some(Device::Grinder) => {
+            (state, Event::RecordDoubted { reason: why, .. }) if running_device(state) == Some(Device::Grinder) => {
                 self.pass_record_doubted = true;
                 self.raise(AlarmId::PassRecord, why);
             }
-            (Stopping, Event::RecordDoubted { why, .. }) => self.raise(AlarmId::PassRecord, why),
+            (Stopping, Event::RecordDoubted { reason: why, .. }) => self.raise(AlarmId::PassRecord, why),
             (state, Event::Reconciled { device, outcome, .. }) if reconciling_device(state) == Some(*device) => {
                 self.on_reconciled(*device, outcome);
             }
@@ -284,23 +284,23 @@ impl Cell {
                 self.on_acknowledged(p);
             }
             (Stopping, Event::Acknowledged { .. }) => self.finish_stopped(),
-            (Execute(p) | Holding(p), Event::Refused { device, what, why }) if awaits_answer(p, *device, *what) => {
+            (Execute(p) | Holding(p), Event::Refused { device, request: what, reason: why }) if awaits_answer(p, *device, *what) => {
                 self.on_refused(p, *device, *what, why);
             }
             (
                 Holding(_) | Suspending(_) | Held(_) | Suspended(_),
-                Event::Refused { device, what: MachineRequest::Hold, why },
+                Event::Refused { device, request: MachineRequest::Hold, reason: why },
             ) => {
                 self.raise(AlarmId::HoldNotConfirmed, &format!("{device}, {why}"));
                 self.abort(&format!("the {device} refused to hold: {why}"));
             }
-            (Unholding(p) | Unsuspending(p), Event::Refused { device, what: MachineRequest::Resume, why })
+            (Unholding(p) | Unsuspending(p), Event::Refused { device, request: MachineRequest::Resume, reason: why })
                 if p.moving_device() == Some(*device) =>
             {
                 self.raise(AlarmId::MachineRefused, &format!("{device}, resume: {why}"));
                 self.enter_state(Held(p));
             }
-            (Stopping, Event::Refused { device, what: MachineRequest::Stop | MachineRequest::Acknowledge | MachineRequest::Discard, why }) => {
+            (Stopping, Event::Refused { device, request: MachineRequest::Stop | MachineRequest::Acknowledge | MachineRequest::Discard, reason: why }) => {
                 self.raise(AlarmId::StopNotConfirmed, &format!("{device}, {why}"));
                 self.abort(&format!("the {device} refused to stop: {why}"));
             }
@@ -317,27 +317,27 @@ impl Cell {
 
             // Computations.
             (Execute(Register) | Holding(Register), Event::Registered { figures, .. }) => self.on_registered(figures),
-            (Execute(Register) | Holding(Register), Event::RegistrationFailed { why, .. }) => {
+            (Execute(Register) | Holding(Register), Event::RegistrationFailed { reason: why, .. }) => {
                 self.reject_measurement(AlarmId::RegistrationFailed, why);
             }
             (
                 Execute(p @ (Register | Compensate | Measure(JobStep::Collect)))
                 | Holding(p @ (Register | Compensate | Measure(JobStep::Collect))),
-                Event::NotSaved { why, .. },
+                Event::NotSaved { reason: why, .. },
             ) => {
                 self.raise_record_failed(why);
                 self.enter_state(Held(p));
             }
             (Execute(Compensate) | Holding(Compensate), Event::Compensated { summary, .. }) => {
                 self.cycle += 1;
-                if summary.asks.is_empty() {
+                if summary.confirmations_required.is_empty() {
                     self.advance(Grind(JobStep::Send));
                 } else {
-                    self.raise(AlarmId::ParameterBeyond, &summary.asks.join("; "));
+                    self.raise(AlarmId::ParameterBeyond, &summary.confirmations_required.join("; "));
                     self.enter_state(Held(Grind(JobStep::Send)));
                 }
             }
-            (Execute(Compensate) | Holding(Compensate), Event::CompensationRefused { why, .. }) => self.on_compensation_refused(why),
+            (Execute(Compensate) | Holding(Compensate), Event::CompensationRefused { reason: why, .. }) => self.on_compensation_refused(why),
 
             // The end, and time.
             (Completing, Event::Cleared { device }) => self.on_final_clearance(*device, true, ""),

@@ -150,7 +150,7 @@ fn sample_plan(disposal: HoldOrStop) -> CellPlan {
             rms_mm: 0.002,
             with_uncertainty: false,
             probability: Tolerance::DEFAULT_PROBABILITY,
-            pv_of: PvPoints::All,
+            pv_points: PvPoints::All,
         },
         stall_share: 0.05,
         stall_mm: 0.0,
@@ -158,19 +158,19 @@ fn sample_plan(disposal: HoldOrStop) -> CellPlan {
         on_divergence: disposal,
         on_refusal: disposal,
         gates: GateLimits {
-            least_found: 0.9,
+            min_found_share: 0.9,
             min_coverage: 0.9,
-            most_shift_mm: 1.0,
-            most_turn_rad: 0.1,
-            most_radius_error_mm: Some(0.002),
+            max_shift_mm: 1.0,
+            max_rotation_rad: 0.1,
+            max_radius_error_mm: Some(0.002),
         },
         removal_budget_mm: 1.0,
-        least_depth_mm: 0.001,
+        min_depth_mm: 0.001,
         clear_at_start: disposal == HoldOrStop::Stop,
         // One of the two plans retries nothing, so that the table shows the reaction to a failure that recurs.
         deadlines: Deadlines {
-            vain_failures: if disposal == HoldOrStop::Stop { 1 } else { u32::MAX },
-            vain: Duration::MAX,
+            max_recurring_failures: if disposal == HoldOrStop::Stop { 1 } else { u32::MAX },
+            recurring_failure_time: Duration::MAX,
             ..Deadlines::default()
         },
     }
@@ -184,11 +184,11 @@ pub fn sample_events(cycle: u32) -> Vec<Event> {
         events.extend(machine_events(device, cycle));
     }
     events.extend(computation_events(cycle));
-    events.push(Event::RecordFailed { why: RecordFailure::DiskFull(String::new()) });
-    events.push(Event::RecordFailed { why: RecordFailure::Unwritable(String::new()) });
+    events.push(Event::RecordFailed { reason: RecordFailure::DiskFull(String::new()) });
+    events.push(Event::RecordFailed { reason: RecordFailure::Unwritable(String::new()) });
     events.push(Event::NotOnRecord { command: Command::Acknowledge { device: Device::Cmm }.name() });
     events.push(Event::NotOnRecord { command: Command::ResumeMachine { device: Device::Cmm }.name() });
-    events.push(Event::ControlLost { why: String::new() });
+    events.push(Event::ControlLost { reason: String::new() });
     events.push(Event::ControlBack);
     events.push(Event::Deadline);
     events
@@ -215,14 +215,14 @@ fn order_events() -> Vec<Event> {
 fn machine_events(device: Device, cycle: u32) -> Vec<Event> {
     let text = String::new;
     let mut events = vec![
-        Event::LinkLost { device, why: text() },
+        Event::LinkLost { device, reason: text() },
         Event::LinkBack { device, boot_id: 1 },
         Event::LinkBack { device, boot_id: 2 },
-        Event::StationFailed { device, why: text() },
+        Event::StationFailed { device, reason: text() },
         Event::Prepared { device, cycle },
         Event::Started { device, cycle },
-        Event::StartUnknown { device, cycle, why: text() },
-        Event::JobVanished { device, why: text() },
+        Event::StartUnknown { device, cycle, reason: text() },
+        Event::JobVanished { device, reason: text() },
         Event::Progressed { device, done: 1, total: 2 },
         Event::MachineHeld { device },
         Event::MachineResumed { device },
@@ -240,7 +240,7 @@ fn machine_events(device: Device, cycle: u32) -> Vec<Event> {
     events.push(Event::NotAutomatic { device, message: text() });
     events.push(Event::AutomaticAgain { device });
     for found in [Occupation::Idle, Occupation::ToClear, Occupation::Busy(text())] {
-        events.push(Event::Connected { device, boot_id: 1, simulated: true, found });
+        events.push(Event::Connected { device, boot_id: 1, simulated: true, occupation: found });
     }
     let unlike = [
         ConnectionRefusal::Unreachable(text()),
@@ -249,7 +249,7 @@ fn machine_events(device: Device, cycle: u32) -> Vec<Event> {
     ];
     let more = [ConnectionRefusal::Inches, ConnectionRefusal::Owned(text()), ConnectionRefusal::AtAnotherJob(text())];
     for why in unlike.into_iter().chain(more) {
-        events.push(Event::NotConnected { device, why });
+        events.push(Event::NotConnected { device, reason: why });
     }
     for result in [JobResult::Complete, JobResult::Stopped, JobResult::Aborted, JobResult::Failed] {
         events.push(Event::Ended { device, cycle, result });
@@ -261,7 +261,7 @@ fn machine_events(device: Device, cycle: u32) -> Vec<Event> {
     }
     use MachineRequest::{Abort, Acknowledge, Clear, Collect, Discard, Hold, Load, Prepare, Resume, Start, Stop};
     for what in [Load, Prepare, Start, Hold, Resume, Stop, Abort, Clear, Collect, Acknowledge, Discard] {
-        events.push(Event::Refused { device, what, why: text() });
+        events.push(Event::Refused { device, request: what, reason: text() });
     }
     events
 }
@@ -279,22 +279,27 @@ fn computation_events(cycle: u32) -> Vec<Event> {
     let mut events: Vec<_> = gates.map(|gate| Event::Collected { cycle, targets: 100, found: 99, gate }).collect();
     events.push(Event::Collected { cycle, targets: 100, found: 10, gate: GateResult::Passed });
     events.push(Event::PassLoaded { cycle });
-    events.push(Event::RecordDoubted { cycle, why: text() });
+    events.push(Event::RecordDoubted { cycle, reason: text() });
     events.push(Event::PlanLoaded { cycle });
     for radius_error_mm in [0.0, 0.010, f64::NAN] {
         events.push(Event::Qualified { cycle, radius_error_mm });
     }
     events.extend(sample_figures().into_iter().map(|figures| Event::Registered { cycle, figures }));
-    events.push(Event::RegistrationFailed { cycle, why: text() });
-    events.push(Event::NotSaved { cycle, why: RecordFailure::DiskFull(text()) });
+    events.push(Event::RegistrationFailed { cycle, reason: text() });
+    events.push(Event::NotSaved { cycle, reason: RecordFailure::DiskFull(text()) });
     let (largest_mm, depth_mm, predicted_pv_mm) = (0.02, 0.03, 0.005);
-    let summary = CompensationSummary { largest_mm, depth_mm, predicted_pv_mm, ..CompensationSummary::default() };
+    let summary = CompensationSummary {
+        max_correction_mm: largest_mm,
+        depth_mm,
+        predicted_pv_mm,
+        ..CompensationSummary::default()
+    };
     events.push(Event::Compensated { cycle, summary: summary.clone() });
-    let asking = CompensationSummary { asks: vec![text()], ..summary };
+    let asking = CompensationSummary { confirmations_required: vec![text()], ..summary };
     events.push(Event::Compensated { cycle, summary: asking });
     let refusals = [CompensationRefusal::BudgetSpent(text()), CompensationRefusal::WeakDirections(Vec::new())];
     for why in refusals.into_iter().chain([CompensationRefusal::Failed(text())]) {
-        events.push(Event::CompensationRefused { cycle, why });
+        events.push(Event::CompensationRefused { cycle, reason: why });
     }
     events
 }
@@ -302,7 +307,7 @@ fn computation_events(cycle: u32) -> Vec<Event> {
 fn sample_figures() -> Vec<Figures> {
     let plain = Figures {
         pv_mm: 0.030,
-        pv_robust_mm: None,
+        pv_998_mm: None,
         rms_mm: 0.006,
         form: None,
         pv_expanded_mm: 0.0005,
@@ -310,16 +315,16 @@ fn sample_figures() -> Vec<Figures> {
         coverage: 0.99,
         points: 99,
         outliers: 0,
-        left_out: None,
+        with_outliers: None,
         shift_mm: 0.1,
-        turn_rad: 0.01,
+        rotation_rad: 0.01,
         weak_directions: Vec::new(),
         warnings: Vec::new(),
         response: None,
         forecast: None,
         removed_mm: Some(0.1),
         unstated: None,
-        touch_on: None,
+        further_touches: None,
     };
     let mut all = vec![
         plain.clone(),
@@ -329,31 +334,31 @@ fn sample_figures() -> Vec<Figures> {
         Figures {
             pv_mm: 0.005,
             rms_mm: 0.001,
-            left_out: Some(Box::new(OutlierFigures {
+            with_outliers: Some(Box::new(OutlierFigures {
                 pv_mm: 0.050,
                 rms_mm: 0.002,
-                places: String::new(),
-                again: false,
+                description: String::new(),
+                can_repeat: false,
             })),
             ..plain.clone()
         },
         Figures {
             pv_mm: 0.005,
             rms_mm: 0.001,
-            left_out: Some(Box::new(OutlierFigures {
+            with_outliers: Some(Box::new(OutlierFigures {
                 pv_mm: 0.050,
                 rms_mm: 0.002,
-                places: String::new(),
-                again: true,
+                description: String::new(),
+                can_repeat: true,
             })),
             ..plain.clone()
         },
         Figures { coverage: 0.5, ..plain.clone() },
         Figures { shift_mm: 5.0, ..plain.clone() },
-        Figures { turn_rad: 3.0, ..plain.clone() },
+        Figures { rotation_rad: 3.0, ..plain.clone() },
         Figures { removed_mm: Some(2.0), ..plain.clone() },
         Figures {
-            touch_on: Some(Box::new(FurtherTouches { targets: 20, why: String::new() })),
+            further_touches: Some(Box::new(FurtherTouches { target_count: 20, reason: String::new() })),
             coverage: 0.1,
             ..plain.clone()
         },

@@ -82,7 +82,7 @@ impl Cell {
     /// `vain_failures`. It is also the case if the series has at least [`MIN_RECURRING_FAILURES`] failures and lasts at
     /// least `vain`.
     fn count_failure(&mut self, device: Device) -> bool {
-        let Deadlines { vain, vain_failures, .. } = self.plan.deadlines;
+        let Deadlines { recurring_failure_time: vain, max_recurring_failures: vain_failures, .. } = self.plan.deadlines;
         let now = self.now;
         let in_sight = matches!(self.state, Execute(phase) if phase == Phase::from_job(device, JobStep::Run));
         let FailureSeries { failures, first: since, last, .. } = &mut self.failure_series[device as usize];
@@ -485,8 +485,8 @@ impl Cell {
         let share = f64::from(found) / f64::from(targets.max(1));
         let gate = match gate {
             GateResult::Failed(why) => Some(gate_alarm(why)),
-            GateResult::Passed if found > targets || share < self.plan.gates.least_found => {
-                let least = 100.0 * self.plan.gates.least_found;
+            GateResult::Passed if found > targets || share < self.plan.gates.min_found_share => {
+                let least = 100.0 * self.plan.gates.min_found_share;
                 Some((
                     AlarmId::Coverage,
                     format!(
@@ -501,13 +501,13 @@ impl Cell {
                 self.raise(id, &case);
                 self.advance(Measure(JobStep::Discard));
             }
-            None if self.plan.gates.most_radius_error_mm.is_some() => self.advance(Measure(JobStep::Qualify)),
+            None if self.plan.gates.max_radius_error_mm.is_some() => self.advance(Measure(JobStep::Qualify)),
             None => self.advance(Measure(JobStep::Acknowledge)),
         }
     }
 
     pub(super) fn on_qualified(&mut self, radius_error_mm: f64) {
-        let most = self.plan.gates.most_radius_error_mm.unwrap_or(f64::INFINITY);
+        let most = self.plan.gates.max_radius_error_mm.unwrap_or(f64::INFINITY);
         if radius_error_mm.abs() <= most {
             return self.advance(Measure(JobStep::Acknowledge));
         }
@@ -525,23 +525,23 @@ impl Cell {
 
     pub(super) fn on_registered(&mut self, figures: &Figures) {
         let gates = self.plan.gates;
-        let (shift, turn) = (figures.shift_mm, figures.turn_rad.to_degrees());
+        let (shift, turn) = (figures.shift_mm, figures.rotation_rad.to_degrees());
         if !figures.are_valid() {
             self.reject_measurement(
                 AlarmId::RegistrationFailed,
                 "a figure of the registration is negative or not a number",
             );
-        } else if figures.touch_on.is_none() && figures.coverage < gates.min_coverage {
+        } else if figures.further_touches.is_none() && figures.coverage < gates.min_coverage {
             let (found, least) = (100.0 * figures.coverage, 100.0 * gates.min_coverage);
             self.reject_measurement(
                 AlarmId::Coverage,
                 &format!("{found:.0} % of the aperture is covered, at least {least:.0} % is required"),
             );
-        } else if shift > gates.most_shift_mm || figures.turn_rad > gates.most_turn_rad {
-            let (most, most_turn) = (gates.most_shift_mm, gates.most_turn_rad.to_degrees());
+        } else if shift > gates.max_shift_mm || figures.rotation_rad > gates.max_rotation_rad {
+            let (most, most_turn) = (gates.max_shift_mm, gates.max_rotation_rad.to_degrees());
             let case = format!("shift {shift:.3} mm, limit {most:.3} mm; turn {turn:.2}°, limit {most_turn:.2}°");
             self.reject_measurement(AlarmId::PartMisplaced, &case);
-        } else if figures.touch_on.is_some() {
+        } else if figures.further_touches.is_some() {
             // More points of the same measurement follow. A partial measurement is not judged.
             self.advance(Measure(JobStep::Send));
         } else {
@@ -558,7 +558,7 @@ impl Cell {
         if verdict == Verdict::LeftOut {
             // The figures of the part are not known yet, so nothing is compared with them.
             self.push(Command::Announce(Judgement { cycle: self.cycle, verdict, reason: reason.clone() }));
-            if !figures.left_out.as_ref().is_some_and(|left_out| left_out.again) {
+            if !figures.with_outliers.as_ref().is_some_and(|left_out| left_out.can_repeat) {
                 return self.reject_measurement(AlarmId::LeftOut, &reason);
             }
             // Touch only the named places again, in the same measurement. A point that is not touched again keeps its

@@ -172,7 +172,7 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
         None => None,
         Some(plant) => match plant::prove(plant, arguments.run.as_deref(), &arguments.key, arguments.json)? {
             copy if !copy.is_here => return Ok(Outcome::Accepted),
-            copy => Some(copy.told),
+            copy => Some(copy.content),
         },
     };
     #[cfg(not(feature = "plant"))]

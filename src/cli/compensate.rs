@@ -113,8 +113,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let values_mm = map.values_mm.iter().map(|v| sign * v).collect();
     let tip_mm = arguments.tip_of_radius.unwrap_or(0.0);
     let level_off_mm = LEVEL_OFF_NODES * map.grid.spacing_mm[0].max(map.grid.spacing_mm[1]);
-    let shift =
-        correction_spline(&Correction { grid: map.grid, values_mm, cycle: 1, level_mm: 0.0, set: None }, level_off_mm);
+    let shift = correction_spline(
+        &Correction { grid: map.grid, values_mm, cycle: 1, level_mm: 0.0, parameters: None },
+        level_off_mm,
+    );
     let ground = arguments.nominal.as_ref().map(|file| ground(file, &arguments.table.table())).transpose()?;
     let amendment = Amendment {
         shift: &shift,
@@ -146,13 +148,13 @@ fn summary(amended: &Amended) -> String {
         amended.straight,
         amended.arcs,
         amended.written,
-        amended.arcs_kept,
-        three_digits(1e3 * amended.largest_mm)
+        amended.arcs_unchanged,
+        three_digits(1e3 * amended.max_shift_mm)
     );
-    if amended.beside_map_mm > 0.0 {
+    if amended.outside_map_mm > 0.0 {
         text += &format!(
             "outside the map: {} mm of {} mm at feed; there, the correction becomes the constant value at the border of the map\n",
-            three_digits(amended.beside_map_mm),
+            three_digits(amended.outside_map_mm),
             three_digits(amended.feed_mm)
         );
     }

@@ -145,14 +145,14 @@ pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<
     let reply = match request {
         // The resume applies to the current state of the cell. If another terminal gives a hold in the meantime, that
         // hold stays.
-        Request::Resume { reason, seen: None } => {
-            let seen = Some(asked(&Request::Status)?.status.number);
-            asked(&Request::Resume { reason: reason.clone(), seen })?
+        Request::Resume { reason, state_number: None } => {
+            let seen = Some(asked(&Request::Status)?.status.state_number);
+            asked(&Request::Resume { reason: reason.clone(), state_number: seen })?
         }
         request => asked(request)?,
     };
     show(&reply, request, &folder, json)?;
-    if reply.taken { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
+    if reply.accepted { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
 }
 
 /// Sends `request` to the cell that executes the run in `folder`, and returns the reply. First uses the control socket
@@ -196,7 +196,7 @@ fn show(reply: &Reply, request: &Request, folder: &Path, json: bool) -> Result<(
         return super::print_json(reply);
     }
     if *request != Request::Status {
-        return if reply.taken { super::print(&format!("{}\n", reply.message)) } else { Ok(()) };
+        return if reply.accepted { super::print(&format!("{}\n", reply.message)) } else { Ok(()) };
     }
     super::print(&status_text(&reply.status, folder))
 }
@@ -211,15 +211,15 @@ fn status_text(status: &Snapshot, folder: &Path) -> String {
         cycle => format!("cycle {cycle} of at most {}", status.max_cycles),
     };
     let _ = writeln!(text, "{marked}{}, {cycle}", status.message);
-    if let Some(JobProgress { device, done, total, left_s }) = status.progress {
+    if let Some(JobProgress { device, done, total, remaining_s: left_s }) = status.progress {
         let left = left_s.map_or(String::new(), |left_s| format!(", {} left", time_left(left_s)));
         let _ = writeln!(text, "{}{left}", how_far(device, done, total));
     }
-    if let Some(told) = &status.so_far {
+    if let Some(told) = &status.preview {
         let _ = writeln!(text, "{}", preview_text(told));
     }
     for alarm in &status.alarms {
-        let _ = writeln!(text, "ALARM    {}\n         {}", alarm.what, alarm.consequence);
+        let _ = writeln!(text, "ALARM    {}\n         {}", alarm.event, alarm.consequence);
         for (k, remedy) in alarm.remedy.iter().enumerate() {
             let _ = writeln!(text, "         {}. {remedy}", k + 1);
         }

@@ -54,9 +54,12 @@ pub(super) struct Arguments {
 /// Result of one check.
 #[derive(Serialize)]
 struct Finding {
-    what: String,
-    found: FindingLevel,
-    words: String,
+    #[serde(rename = "what")]
+    check: String,
+    #[serde(rename = "found")]
+    level: FindingLevel,
+    #[serde(rename = "words")]
+    message: String,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, Serialize)]
@@ -71,7 +74,7 @@ enum FindingLevel {
 
 impl Finding {
     fn new(what: impl Into<String>, found: FindingLevel, words: impl Into<String>) -> Self {
-        Self { what: what.into(), found, words: words.into() }
+        Self { check: what.into(), level: found, message: words.into() }
     }
 
     fn from_result<E: std::fmt::Display>(what: &str, looked: Result<String, E>) -> Self {
@@ -97,12 +100,12 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     } else {
         super::print(&findings.iter().map(in_words).collect::<String>())?;
     }
-    let obstacle = findings.iter().any(|finding| finding.found == FindingLevel::Obstacle);
+    let obstacle = findings.iter().any(|finding| finding.level == FindingLevel::Obstacle);
     Ok(if obstacle { Outcome::NotInTolerance } else { Outcome::Accepted })
 }
 
 fn in_words(finding: &Finding) -> String {
-    let Finding { what, found, words } = finding;
+    let Finding { check: what, level: found, message: words } = finding;
     let mark = match found {
         FindingLevel::Good => "ok",
         FindingLevel::Notice => "note",

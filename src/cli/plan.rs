@@ -53,7 +53,8 @@ struct Document {
     /// True if the targets are touched in batches, and the measurement ends when enough is known.
     touches_are_chosen: bool,
     sphere_points: usize,
-    most_cycles: u32,
+    #[serde(rename = "most_cycles")]
+    max_cycles: u32,
     first_level_um: f64,
     depth_of_cut_um: f64,
     last_level_um: f64,
@@ -71,13 +72,16 @@ struct Document {
     #[serde(skip_serializing_if = "Option::is_none")]
     wheel_loss_mm3_a_pass: Option<f64>,
     /// Maximum number of passes and of measurements that the recipe allows.
-    most_passes: u32,
-    most_measurements: u32,
+    #[serde(rename = "most_passes")]
+    max_passes: u32,
+    #[serde(rename = "most_measurements")]
+    max_measurements: u32,
     /// Minimum duration of one measurement, from its search moves alone; absent if the operator takes the points.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    least_measuring_minutes: Option<f64>,
+    #[serde(rename = "least_measuring_minutes", skip_serializing_if = "Option::is_none")]
+    min_measuring_minutes: Option<f64>,
     /// Hours of all passes, plus the minimum duration of all measurements.
-    least_hours_to_last: f64,
+    #[serde(rename = "least_hours_to_last")]
+    min_hours_total: f64,
     /// Warnings to read before the run.
     warnings: Vec<String>,
     /// Number of points in the program of one pass; absent if no program can be made.
@@ -108,11 +112,13 @@ struct ArcsDocument {
     moves_per_second: f64,
     lines_alone_per_second: f64,
     /// Maximum distance of an arc from the path, and its limit.
-    largest_deviation_um: f64,
+    #[serde(rename = "largest_deviation_um")]
+    max_deviation_um: f64,
     within_um: f64,
     /// Largest angle between the direction at the end of a move and the direction at the start of the next move, and
     /// the same angle for the program with lines only.
-    largest_corner_mrad: f64,
+    #[serde(rename = "largest_corner_mrad")]
+    max_corner_mrad: f64,
     lines_alone_corner_mrad: f64,
 }
 
@@ -124,9 +130,9 @@ impl ArcsDocument {
             lines: arcs.lines,
             moves_per_second: (arcs.arcs + arcs.lines) as f64 / summary.duration_s,
             lines_alone_per_second: summary.points as f64 / summary.duration_s,
-            largest_deviation_um: 1e3 * arcs.deviation_mm,
+            max_deviation_um: 1e3 * arcs.deviation_mm,
             within_um: 1e3 * within_mm,
-            largest_corner_mrad,
+            max_corner_mrad: largest_corner_mrad,
             lines_alone_corner_mrad,
         }
     }
@@ -140,9 +146,9 @@ impl ArcsDocument {
             counted(points as usize, "line"),
             n(self.moves_per_second),
             n(self.lines_alone_per_second),
-            n(self.largest_deviation_um),
+            n(self.max_deviation_um),
             n(self.within_um),
-            n(self.largest_corner_mrad),
+            n(self.max_corner_mrad),
             n(self.lines_alone_corner_mrad),
         )
     }
@@ -152,12 +158,16 @@ impl ArcsDocument {
 #[derive(Serialize)]
 struct TiltDocument {
     axis: char,
-    least_deg: f64,
-    most_deg: f64,
-    largest_rate_deg_min: f64,
+    #[serde(rename = "least_deg")]
+    min_deg: f64,
+    #[serde(rename = "most_deg")]
+    max_deg: f64,
+    #[serde(rename = "largest_rate_deg_min")]
+    max_rate_deg_min: f64,
     /// Minimum angle between the upright direction of the head and the normals of the part. At 0, a spherical wheel
     /// touches with its pole, where the surface speed is 0.
-    least_lean_deg: f64,
+    #[serde(rename = "least_lean_deg")]
+    min_tilt_deg: f64,
 }
 
 impl TiltDocument {
@@ -167,10 +177,10 @@ impl TiltDocument {
         let [a, b] = [on_scale(turned.min_tilt_rad), on_scale(turned.max_tilt_rad)];
         Some(Self {
             axis: turned.rotary.letter,
-            least_deg: a.min(b),
-            most_deg: a.max(b),
-            largest_rate_deg_min: 60.0 * turned.max_rate_rad_s.value.to_degrees(),
-            least_lean_deg: path.min_head_angle_rad().to_degrees(),
+            min_deg: a.min(b),
+            max_deg: a.max(b),
+            max_rate_deg_min: 60.0 * turned.max_rate_rad_s.value.to_degrees(),
+            min_tilt_deg: path.min_head_angle_rad().to_degrees(),
         })
     }
 
@@ -179,10 +189,10 @@ impl TiltDocument {
         format!(
             "tilt        rotary axis {} from {} to {}°, at most {}°/min; smallest angle between the upright head and a normal of the part: {}°\n",
             self.axis,
-            n(self.least_deg),
-            n(self.most_deg),
-            n(self.largest_rate_deg_min),
-            n(self.least_lean_deg),
+            n(self.min_deg),
+            n(self.max_deg),
+            n(self.max_rate_deg_min),
+            n(self.min_tilt_deg),
         )
     }
 }
@@ -280,7 +290,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         targets: task.targets.len(),
         touches_are_chosen: task.adaptive.is_some(),
         sphere_points: task.reference_sphere.map_or(0, |s| s.points),
-        most_cycles: plan.max_cycles,
+        max_cycles: plan.max_cycles,
         first_level_um: first_um,
         depth_of_cut_um: depth_um,
         last_level_um: first_um - (passes * depth_um).min(1e3 * task.correction_limits.removal_budget_mm),
@@ -292,10 +302,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         grinding_minutes,
         removed_mm3_a_pass,
         wheel_loss_mm3_a_pass: recipe.grinding.grinding_ratio.map(|ratio| removed_mm3_a_pass / ratio),
-        most_passes: plan.max_cycles,
-        most_measurements,
-        least_measuring_minutes,
-        least_hours_to_last: least_minutes / 60.0,
+        max_passes: plan.max_cycles,
+        max_measurements: most_measurements,
+        min_measuring_minutes: least_measuring_minutes,
+        min_hours_total: least_minutes / 60.0,
         warnings: warnings(&task, path_mm, grinding_minutes, least_measuring_minutes)
             .into_iter()
             .chain(warning_of_scallops(&task, &recipe))
@@ -385,16 +395,16 @@ fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
 /// allowed passes are needed.
 fn time_in_words(d: &Document) -> String {
     let n = three_digits;
-    let measurements = counted(d.most_measurements as usize, "measurement");
-    let measuring = d.least_measuring_minutes.map_or("of unknown duration".to_owned(), |minutes| {
+    let measurements = counted(d.max_measurements as usize, "measurement");
+    let measuring = d.min_measuring_minutes.map_or("of unknown duration".to_owned(), |minutes| {
         format!("of at least {} minutes, counting only the search moves", n(minutes))
     });
     format!(
         "at most {} of {} minutes and {measurements} {measuring}: {} h or more, if all passes and measurements are needed. This does not include the time for moves between \
          points and for loading: the recipe and the cell file do not state this time",
-        if d.most_passes == 1 { "1 pass".to_owned() } else { format!("{} passes", d.most_passes) },
+        if d.max_passes == 1 { "1 pass".to_owned() } else { format!("{} passes", d.max_passes) },
         n(d.grinding_minutes),
-        n(d.least_hours_to_last),
+        n(d.min_hours_total),
     )
 }
 
@@ -403,7 +413,7 @@ fn time_in_words(d: &Document) -> String {
 /// says so.
 fn removal_in_words(d: &Document) -> String {
     let n = three_digits;
-    let most = f64::from(d.most_passes);
+    let most = f64::from(d.max_passes);
     let wheel = match d.wheel_loss_mm3_a_pass {
         Some(loss) => {
             format!("the wheel loses about {} mm3 in a pass, {} mm3 in all allowed passes", n(loss), n(most * loss))
@@ -468,7 +478,7 @@ fn words(d: &Document) -> String {
         n(d.last_level_um),
         n(d.removal_budget_um),
         removal_in_words(d),
-        d.most_cycles,
+        d.max_cycles,
         time_in_words(d),
     )
 }

@@ -311,7 +311,7 @@ async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
     // A run that does not answer delays only this report.
     let recorded = tokio::task::spawn_blocking(move || {
         let run = control::live_runs(&runs).next()?;
-        Some(regrind_control::send_request_on_behalf(&run, &remark, Some(by)).is_ok_and(|reply| reply.taken))
+        Some(regrind_control::send_request_on_behalf(&run, &remark, Some(by)).is_ok_and(|reply| reply.accepted))
     });
     if recorded.await.ok().flatten() == Some(false) {
         eprintln!("tell: the run did not record the refused request");

@@ -222,7 +222,7 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
     line("iterations", format!("{}, converged", document.iterations));
     line("coverage", format!("{:.0} % of the nominal surface", 100.0 * document.coverage));
     for weak in document.weak_directions {
-        line("weak", weak.words.clone());
+        line("weak", weak.description.clone());
     }
     for warning in document.warnings {
         line("warning", warning.clone());
@@ -284,7 +284,7 @@ fn form_in_words(form: &Form) -> String {
 /// computed, for example from too few points. The text is empty if both are missing.
 fn area_in_words(form: &Form) -> String {
     let mut text = String::new();
-    if let Some(SlopeFigures { rms, largest, integration_mm, .. }) = form.slope {
+    if let Some(SlopeFigures { rms, max: largest, integration_mm, .. }) = form.slope {
         let urad = |of: AngleInterval| {
             let [median, low, high] = [of.median_rad, of.low_rad, of.high_rad].map(|rad| three_digits(1e6 * rad));
             format!("{median} urad ({low} to {high})")

@@ -69,7 +69,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         None => control::live_or(Path::new("runs"), control::unfinished)?,
     };
     if control::is_driven(&folder) {
-        let request = Request::Resume { reason: arguments.reason.clone(), seen: None };
+        let request = Request::Resume { reason: arguments.reason.clone(), state_number: None };
         return control::give(Some(&folder), &request, arguments.json);
     }
     take_up(arguments, &std::path::absolute(&folder).unwrap_or(folder))

@@ -205,7 +205,7 @@ struct EarlierKnowledge {
     /// Knowledge of the newest finished run with the same setting, and the content of its file.
     learned: Option<(Learned, Vec<u8>)>,
     /// Errors of runs that could not be read during the search.
-    left_alone: Vec<LearnedError>,
+    skipped: Vec<LearnedError>,
     /// Messages about the knowledge of the plant.
     messages: Vec<String>,
 }
@@ -238,7 +238,7 @@ impl EarlierKnowledge {
     #[cfg(feature = "plant")]
     fn or_apply_plant(mut self, task: &mut Task, plant: &Path) -> Result<Self, Failure> {
         let told = super::plant::knowledge::query_knowledge(plant, task)?;
-        self.messages = told.words;
+        self.messages = told.description;
         if let Some(learned) = told.learned {
             // Read back in the same way as by a program that resumes the run.
             let text = serde_json::to_vec(&learned).map_err(|error| Failure::Terminal(error.into()))?;
@@ -266,17 +266,17 @@ impl EarlierKnowledge {
             match Learned::read(&run, setting, simulated) {
                 Ok(None) => {}
                 Ok(found) => return Self { learned: found, ..earlier },
-                Err(error) => earlier.left_alone.push(error),
+                Err(error) => earlier.skipped.push(error),
             }
         }
         earlier
     }
 
     fn in_words(&self, runs: &Path) -> String {
-        let mut text: String = self.left_alone.iter().map(|error| format!("ignored: {error}\n")).collect();
+        let mut text: String = self.skipped.iter().map(|error| format!("ignored: {error}\n")).collect();
         text.extend(self.messages.iter().map(|words| format!("{words}\n")));
         text += &match &self.learned {
-            Some((Learned { taught_by: Some(others), .. }, _)) => others_in_words(others),
+            Some((Learned { origin: Some(others), .. }, _)) => others_in_words(others),
             Some((learned, _)) => format!(
                 "begins with the error that {} found in every pass: the first pass corrects this error\n",
                 learned.run
@@ -296,10 +296,11 @@ impl EarlierKnowledge {
 fn others_in_words(others: &KnowledgeOrigin) -> String {
     let runs: Vec<String> = others.runs.iter().map(|from| format!("{} (run {})", from.cell, from.run)).collect();
     let runs = runs.join(" and ");
-    let percent =
-        |of: fn(f64, f64) -> f64| 100.0 * others.differ.iter().map(|[_, share]| *share).reduce(of).unwrap_or(0.0);
+    let percent = |of: fn(f64, f64) -> f64| {
+        100.0 * others.machine_difference.iter().map(|[_, share]| *share).reduce(of).unwrap_or(0.0)
+    };
     let [least, most] = [percent(f64::min), percent(f64::max)];
-    match others.differ.is_empty() {
+    match others.machine_difference.is_empty() {
         false => format!(
             "begins with the knowledge from {runs}; {least:.0} to {most:.0} % (RMS, by wavelength) of the repeatable error are assumed to be specific to one machine, based on {} comparison(s) of machines\n",
             others.comparisons
@@ -339,8 +340,8 @@ fn header(
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
     let learned_from = earlier.and_then(|earlier| earlier.learned.as_ref()).map(|(learned, _)| &learned.run);
     let taught_by =
-        earlier.and_then(|earlier| earlier.learned.as_ref()).and_then(|(learned, _)| learned.taught_by.as_ref());
-    let left_alone = earlier.iter().flat_map(|earlier| &earlier.left_alone).map(ToString::to_string);
+        earlier.and_then(|earlier| earlier.learned.as_ref()).and_then(|(learned, _)| learned.origin.as_ref());
+    let left_alone = earlier.iter().flat_map(|earlier| &earlier.skipped).map(ToString::to_string);
     let left_alone: Vec<String> =
         left_alone.chain(earlier.iter().flat_map(|earlier| earlier.messages.clone())).collect();
     // The open ports are assigned by now. The text of the file shows whether they were open.

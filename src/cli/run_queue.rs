@@ -68,7 +68,7 @@ pub(super) struct Arguments {
     give_up: Option<String>,
     /// Reason for giving it up, for the record
     #[arg(long, value_name = "WORDS", value_parser = super::name, requires = "give_up")]
-    why: Option<String>,
+    reason: Option<String>,
     /// Seed of other simulated parts and runs
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
@@ -107,7 +107,7 @@ impl ConfirmedPart {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let config = plant::read(&arguments.plant)?;
     if let Some(serial) = arguments.give_back.as_ref().or(arguments.give_up.as_ref()) {
-        return super::runtime()?.block_on(give(&config, &arguments.runs, serial, arguments.why.as_deref()));
+        return super::runtime()?.block_on(give(&config, &arguments.runs, serial, arguments.reason.as_deref()));
     }
     loop {
         let (recipe, taken) = match super::runtime()?.block_on(next(&config, arguments))? {

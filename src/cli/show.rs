@@ -92,10 +92,10 @@ impl Show {
 
     fn show(&mut self, notice: &Notice) -> Result<(), Failure> {
         match notice {
-            Notice::Progress { device, cycle, done, total, left_s } => {
+            Notice::Progress { device, cycle, done, total, remaining_s: left_s } => {
                 self.progress((*device, *cycle), *done, *total, *left_s)
             }
-            Notice::State { state, cycle, event, at_job } => {
+            Notice::State { state, cycle, event, has_progress: at_job } => {
                 if let Some(bar) = &self.bar {
                     // The bar of a job ends with the job.
                     if !at_job {
@@ -128,7 +128,7 @@ impl Show {
             Notice::Compensated { cycle, summary } => {
                 self.line(&format!(
                     "cycle {cycle}: next pass corrects up to {} µm, depth {} µm, {}, gain {}; expected PV {} µm, RMS {} µm",
-                    three_digits(1e3 * summary.largest_mm),
+                    three_digits(1e3 * summary.max_correction_mm),
                     three_digits(1e3 * summary.depth_mm),
                     in_air(summary.air_share),
                     gains(&summary.gains),
@@ -144,16 +144,16 @@ impl Show {
                 summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
             }
             // The record contains every repetition, but a person needs to see the alarm only once.
-            Notice::Alarm(alarm) if self.alarms.get(&alarm.id) == Some(&alarm.what) => Ok(()),
+            Notice::Alarm(alarm) if self.alarms.get(&alarm.id) == Some(&alarm.event) => Ok(()),
             Notice::Alarm(alarm) => {
-                self.alarms.insert(alarm.id, alarm.what.clone());
+                self.alarms.insert(alarm.id, alarm.event.clone());
                 self.alarm(alarm)
             }
             Notice::AlarmGone { alarm } => {
                 self.alarms.remove(alarm);
                 Ok(())
             }
-            Notice::Refused { why } => self.line(&format!("refused: {why}")),
+            Notice::Refused { reason: why } => self.line(&format!("refused: {why}")),
             Notice::RecordFailed { message } => self.line(&format!("RECORD: {message}")),
             Notice::Finished { ending, cycles, touches } => self.finished(ending, cycles, *touches),
         }
@@ -194,7 +194,7 @@ impl Show {
         let compared = self.tolerance.compare(figures);
         let [pv, rms] = compared.map(|compared| judged(&compared));
         let (points, outliers) = (figures.points, figures.outliers);
-        if let Some(FurtherTouches { targets, why }) = figures.touch_on.as_deref() {
+        if let Some(FurtherTouches { target_count: targets, reason: why }) = figures.further_touches.as_deref() {
             // The first touches only show that they belong to this part.
             let known = figures
                 .form
@@ -244,7 +244,7 @@ impl Show {
     }
 
     fn alarm(&mut self, alarm: &Alarm) -> Result<(), Failure> {
-        let mut text = format!("ALARM    {}\n         {}", alarm.what, alarm.consequence);
+        let mut text = format!("ALARM    {}\n         {}", alarm.event, alarm.consequence);
         for (k, remedy) in alarm.remedy.iter().enumerate() {
             let _ = write!(text, "\n         {}. {remedy}", k + 1);
         }
@@ -351,7 +351,9 @@ pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
 
 /// Returns a line of text about a measurement that is not yet complete. The line states the number of touches on the
 /// part, and the RMS, minimum and maximum of the deviations from the planned positions in µm.
-pub(super) fn preview_text(PreviewStatistics { touched, rms_um, least_um, most_um }: &PreviewStatistics) -> String {
+pub(super) fn preview_text(
+    PreviewStatistics { touch_count: touched, rms_um, min_um: least_um, max_um: most_um }: &PreviewStatistics,
+) -> String {
     format!(
         "preliminary, relative to the planned position: {touched} points touched, RMS {rms_um:.2} µm, deviations from {least_um:+.2} to {most_um:+.2} µm"
     )
@@ -360,7 +362,7 @@ pub(super) fn preview_text(PreviewStatistics { touched, rms_um, least_um, most_u
 /// Returns the name of the PV (peak-to-valley) figure to which the PV limit applies: `PV` for all points, or `PV 99.8
 /// %` if the highest and the lowest 0.1 % are omitted.
 pub(super) fn pv_name(tolerance: &Tolerance) -> &'static str {
-    match tolerance.pv_of {
+    match tolerance.pv_points {
         PvPoints::All => "PV",
         PvPoints::MostPoints => "PV 99.8 %",
     }

@@ -147,7 +147,7 @@ fn time_in(name: &str) -> Option<&str> {
 /// Verification of the runs of a folder: flaws, and the state of each run.
 #[derive(Debug, Default)]
 struct Proof {
-    told: Vec<Value>,
+    records: Vec<Value>,
     flaws: Vec<String>,
     are_under_way: bool,
 }
@@ -170,7 +170,7 @@ pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outco
         proof.follows((*number, folder), before.as_ref(), last);
         last = Some((*number, folder));
     }
-    let Proof { told, flaws, are_under_way } = &proof;
+    let Proof { records: told, flaws, are_under_way } = &proof;
     if json {
         super::print_json(&json!({ "runs": runs, "sound": flaws.is_empty(), "flaws": flaws, "each": told }))?;
     } else {
@@ -217,7 +217,7 @@ impl Proof {
             self.flaws.push(format!("{name}: the run began with the name {begun_as}: its folder was renamed"));
         }
         let words = format!("{number:>6}  {name}  {stands}");
-        self.told
+        self.records
             .push(json!({ "number": place.map(|place| place.number), "run": name, "stands": stands, "words": words }));
     }
 

@@ -166,7 +166,7 @@ impl View {
     ///
     /// Keeps the displayed map if the record has no newer one, or if the newer map cannot be read.
     fn read_map(&mut self) {
-        let number = self.snapshot.number;
+        let number = self.snapshot.state_number;
         if self.looked.is_some_and(|(at, of)| of == number || at.elapsed() < BETWEEN_LOOKS) {
             return;
         }
@@ -228,7 +228,7 @@ impl View {
     }
 
     fn job(&self, frame: &mut Frame, area: Rect) {
-        let Some(JobProgress { device, done, total, left_s }) = self.snapshot.progress else { return };
+        let Some(JobProgress { device, done, total, remaining_s: left_s }) = self.snapshot.progress else { return };
         let left = left_s.map_or(String::new(), |left_s| format!(", {} left", time_left(left_s)));
         let ratio = (f64::from(done) / f64::from(total.max(1))).clamp(0.0, 1.0);
         let gauge = Gauge::default()
@@ -237,7 +237,7 @@ impl View {
             .label(format!("{}{left}", how_far(device, done, total)));
         let [bar, below] = Layout::vertical([Constraint::Length(1), Constraint::Min(0)]).areas(area);
         frame.render_widget(gauge, bar);
-        if let Some(told) = &self.snapshot.so_far {
+        if let Some(told) = &self.snapshot.preview {
             frame.render_widget(Paragraph::new(preview_text(told)).dim(), below);
         }
     }
@@ -245,7 +245,7 @@ impl View {
     fn alarms(&self) -> Text<'_> {
         let of = |alarm: &regrind::cell::Alarm| {
             let remedy = alarm.remedy.iter().zip(1..).map(|(remedy, k)| format!("  {k}. {remedy}")).collect::<String>();
-            [Line::from(format!("ALARM  {}", alarm.what)).bold(), Line::from(format!("{}{remedy}", alarm.consequence))]
+            [Line::from(format!("ALARM  {}", alarm.event)).bold(), Line::from(format!("{}{remedy}", alarm.consequence))]
         };
         Text::from(self.snapshot.alarms.iter().flat_map(of).collect::<Vec<_>>())
     }

@@ -24,8 +24,8 @@ pub enum Request {
         reason: String,
         /// Number of the state that the person saw, [`Snapshot::number`]. An order that was meant for another state is
         /// refused.
-        #[serde(default)]
-        seen: Option<u64>,
+        #[serde(rename = "seen", default)]
+        state_number: Option<u64>,
     },
     /// Order to end in an orderly way.
     Stop {
@@ -78,8 +78,8 @@ pub enum Request {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Reply {
     /// True if the order was accepted. It is not a verdict on the part.
-    #[serde(alias = "accepted")]
-    pub taken: bool,
+    #[serde(rename = "taken", alias = "accepted")]
+    pub accepted: bool,
     /// Reason of a refusal, or state of the cell after the order, for the person who gave the order.
     #[serde(rename = "words")]
     pub message: String,
@@ -102,8 +102,8 @@ pub struct OnBehalf {
 pub(super) struct RequestLine {
     #[serde(flatten)]
     pub(super) request: Request,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(super) by: Option<OnBehalf>,
+    #[serde(rename = "by", default, skip_serializing_if = "Option::is_none")]
+    pub(super) on_behalf: Option<OnBehalf>,
 }
 
 impl RequestLine {
@@ -119,7 +119,7 @@ impl RequestLine {
             Request::Remark { what } => Some(what),
             _ => None,
         };
-        let by = self.by.iter().flat_map(|by| by.name.iter().chain([&by.station]));
+        let by = self.on_behalf.iter().flat_map(|by| by.name.iter().chain([&by.station]));
         text.into_iter().chain(by).any(|text| misleading(text).is_some())
     }
 }

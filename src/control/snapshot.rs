@@ -31,21 +31,22 @@ pub struct Snapshot {
     #[serde(default)]
     pub verdict: PartVerdict,
     /// Counter of the states since the run began, so that an order can name the state it is meant for.
-    #[serde(default)]
-    pub number: u64,
+    #[serde(rename = "number", default)]
+    pub state_number: u64,
     /// Number of the cycle; 0 before the first.
     pub cycle: u32,
     /// Maximum number of cycles.
     #[serde(default)]
     pub max_cycles: u32,
     /// Time since the run began, in seconds.
-    pub seconds: f64,
+    #[serde(rename = "seconds")]
+    pub elapsed_s: f64,
     /// Progress of the current job.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<JobProgress>,
     /// Preliminary result of the current measurement, if the CMM reports touches before the end.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub so_far: Option<PreviewStatistics>,
+    #[serde(rename = "so_far", default, skip_serializing_if = "Option::is_none")]
+    pub preview: Option<PreviewStatistics>,
     /// Tolerance against which the figures of a cycle are judged.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tolerance: Option<Tolerance>,
@@ -172,8 +173,8 @@ pub struct JobProgress {
     pub total: u32,
     /// Minimum and maximum remaining time, in seconds. The bounds come from the average pace since the machine began to
     /// move and from the recent pace. `None` before a pace is known, and while the machine is at rest.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub left_s: Option<[f64; 2]>,
+    #[serde(rename = "left_s", default, skip_serializing_if = "Option::is_none")]
+    pub remaining_s: Option<[f64; 2]>,
 }
 
 /// Preliminary statistics of the touches of a measurement that still runs. Deviations refer to the planned position of
@@ -181,13 +182,16 @@ pub struct JobProgress {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PreviewStatistics {
     /// Number of touches of the part so far.
-    pub touched: u32,
+    #[serde(rename = "touched")]
+    pub touch_count: u32,
     /// Root mean square of their deviations along the normals, in µm.
     pub rms_um: f64,
     /// Minimum deviation, in µm; positive if material is above the surface.
-    pub least_um: f64,
+    #[serde(rename = "least_um")]
+    pub min_um: f64,
     /// Maximum deviation, in µm; positive if material is above the surface.
-    pub most_um: f64,
+    #[serde(rename = "most_um")]
+    pub max_um: f64,
 }
 
 /// Row of a cycle in the table at the end of a run.

@@ -241,7 +241,9 @@ async fn serve_client(caller: Client, desk: ControlService) -> io::Result<()> {
                 .into(),
             &status,
         ),
-        Ok(RequestLine { request, by }) => forward_request(request, on_behalf(peer, by), &orders, &status).await,
+        Ok(RequestLine { request, on_behalf: by }) => {
+            forward_request(request, on_behalf(peer, by), &orders, &status).await
+        }
         Err(error) => refusal(format!("not an order: {error}"), &status),
     };
     send_reply(&mut write, &reply).await
@@ -259,7 +261,7 @@ async fn forward_request(
     status: &watch::Receiver<Snapshot>,
 ) -> Reply {
     if request == Request::Status {
-        return Reply { taken: true, message: String::new(), status: status.borrow().clone() };
+        return Reply { accepted: true, message: String::new(), status: status.borrow().clone() };
     }
     let over = || refusal("the run is over".into(), status);
     let (answer, answered) = oneshot::channel();
@@ -279,7 +281,7 @@ async fn forward_request(
 }
 
 fn refusal(message: String, status: &watch::Receiver<Snapshot>) -> Reply {
-    Reply { taken: false, message, status: status.borrow().clone() }
+    Reply { accepted: false, message, status: status.borrow().clone() }
 }
 
 /// Sends the present `status` of the cell to a client through `write`, and sends it again after each change, but at
@@ -290,7 +292,7 @@ fn refusal(message: String, status: &watch::Receiver<Snapshot>) -> Reply {
 async fn stream_status(write: &mut ClientWriter, status: &mut watch::Receiver<Snapshot>) -> io::Result<()> {
     loop {
         let now = status.borrow_and_update().clone();
-        send_reply(write, &Reply { taken: true, message: String::new(), status: now }).await?;
+        send_reply(write, &Reply { accepted: true, message: String::new(), status: now }).await?;
         tokio::time::sleep(MIN_LINE_INTERVAL).await;
         // A timeout sends the state again, as a change does.
         if let Ok(Err(_)) = tokio::time::timeout(MAX_LINE_INTERVAL, status.changed()).await {
@@ -357,7 +359,7 @@ pub fn send_request_at(place: &Path, request: &Request) -> io::Result<Reply> {
 }
 
 fn encode_line(request: &Request, by: Option<OnBehalf>) -> io::Result<Vec<u8>> {
-    let mut text = serde_json::to_vec(&RequestLine { request: request.clone(), by })?;
+    let mut text = serde_json::to_vec(&RequestLine { request: request.clone(), on_behalf: by })?;
     text.push(b'\n');
     Ok(text)
 }
@@ -389,7 +391,7 @@ impl StatusStream {
     /// too many clients already watch.
     pub async fn next(&mut self) -> io::Result<Option<Snapshot>> {
         let Some(text) = tokio::time::timeout(SILENCE_TIMEOUT, self.lines.next_line()).await?? else { return Ok(None) };
-        let Reply { taken, message, status } = serde_json::from_str(&text)?;
+        let Reply { accepted: taken, message, status } = serde_json::from_str(&text)?;
         if taken { Ok(Some(status)) } else { Err(io::Error::other(message)) }
     }
 }

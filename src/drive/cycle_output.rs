@@ -92,7 +92,7 @@ pub(super) fn save_parameters(
     contacts: &[SurfacePoint],
 ) -> Result<Option<ParameterEstimation>, FormatError> {
     let path = files.add_file("parameters.json");
-    let options = task.parameter_options(cycle.correction.set.as_ref());
+    let options = task.parameter_options(cycle.correction.parameters.as_ref());
     match compensation::estimate_parameters(contacts, None, &options) {
         Ok(told) => write_json_atomic(path, &parameter_document(task, &told)).map(|()| Some(told)),
         Err(error) => {
@@ -135,7 +135,7 @@ pub(super) fn next_parameter_corrections(
     told: &ParameterEstimation,
 ) -> Option<ParameterCorrections> {
     let taken = task.parameter_compensation.as_ref()?;
-    let before = cycle.correction.set.as_ref();
+    let before = cycle.correction.parameters.as_ref();
     let mut values = before.map_or([0.0; ParameterKind::COUNT], |set| set.values);
     values.iter_mut().zip(&told.estimates).for_each(|(value, of)| *value += of.compensated);
     if before.is_some_and(|before| before.values == values) {
@@ -161,7 +161,7 @@ pub(super) fn parameter_explainer<'t>(
     contacts: &'t [SurfacePoint],
 ) -> Option<impl Fn(&[f64]) -> Vec<f64> + use<'t>> {
     let taken = task.parameter_compensation.as_ref()?;
-    let options = task.parameter_options(cycle.correction.set.as_ref());
+    let options = task.parameter_options(cycle.correction.parameters.as_ref());
     let grid = cycle.correction.grid;
     Some(move |values_mm: &[f64]| {
         compensation::explained_by_parameters(values_mm, &grid, [contacts, &taken.node_points], &options)

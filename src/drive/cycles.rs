@@ -123,7 +123,7 @@ impl Cycles {
     /// A prior that this cell received from another cell is not included. The result is later sent to other cells, and
     /// they would receive their own results again.
     pub(super) fn part_priors(&self, task: &Task) -> PartPriors {
-        let of_this_cell = task.learned.as_ref().filter(|learned| learned.taught_by.is_none());
+        let of_this_cell = task.learned.as_ref().filter(|learned| learned.origin.is_none());
         let mut taught = of_this_cell.map(|learned| learned.fields).unwrap_or_default();
         for is_corrected in [false, true] {
             let alike = |cycle: &&CycleState| cycle.is_judged() && cycle.correction.is_zero() != is_corrected;

@@ -253,7 +253,7 @@ enum RecordAction {
 /// Converts a change of the control endpoint (lost or created again) into an event.
 fn control_event(change: EndpointChange) -> Event {
     match change {
-        EndpointChange::Lost(why) => Event::ControlLost { why },
+        EndpointChange::Lost(why) => Event::ControlLost { reason: why },
         EndpointChange::Restored => Event::ControlBack,
     }
 }
@@ -439,8 +439,10 @@ impl Drive {
                 let gate = GateResult::Failed(GateFailure::Broken(why));
                 Event::Collected { cycle, targets: 0, found: 0, gate }
             }
-            Computation::Registration | Computation::FinalRegistration => Event::RegistrationFailed { cycle, why },
-            Computation::Compensation => Event::CompensationRefused { cycle, why: CompensationRefusal::Failed(why) },
+            Computation::Registration | Computation::FinalRegistration => {
+                Event::RegistrationFailed { cycle, reason: why }
+            }
+            Computation::Compensation => Event::CompensationRefused { cycle, reason: CompensationRefusal::Failed(why) },
         };
         self.handle_event(event, None).await;
     }
@@ -463,7 +465,7 @@ impl Drive {
                     RecordAction::Execute(command) => self.report_not_recorded(*command).await,
                     RecordAction::Answer { answer, message, .. } => {
                         let message = format!("{message}; not recorded: {reason}");
-                        drop(answer.send(Reply { taken: false, message, status: self.snapshot() }));
+                        drop(answer.send(Reply { accepted: false, message, status: self.snapshot() }));
                     }
                     RecordAction::Confirm { answer, .. } => drop(answer.send(Err(format!("not recorded: {reason}")))),
                     RecordAction::Nothing => {}
@@ -477,7 +479,7 @@ impl Drive {
             RecordAction::Execute(command) => self.report_start_not_sent(*command).await,
             // The person who asked may be gone.
             RecordAction::Answer { answer, accepted, message } => {
-                drop(answer.send(Reply { taken: accepted, message, status: self.snapshot() }))
+                drop(answer.send(Reply { accepted, message, status: self.snapshot() }))
             }
             RecordAction::Confirm { device, confirmation: word, answer } => {
                 self.send_request(device, StationRequest::Confirm { confirmation: word, answer }).await
@@ -490,7 +492,7 @@ impl Drive {
     async fn report_start_not_sent(&mut self, command: Command) {
         if let Command::StartMachine { device, .. } = command {
             let why = "START was not sent, because START could not be recorded, or because the cell was held before START was recorded".to_owned();
-            self.handle_event(Event::Refused { device, what: MachineRequest::Start, why }, None).await;
+            self.handle_event(Event::Refused { device, request: MachineRequest::Start, reason: why }, None).await;
         }
     }
 
@@ -517,7 +519,7 @@ impl Drive {
         // The consequences of a failure fail too, including the record of the failure itself. They bring nothing new.
         if !is_known {
             self.notify(Notice::RecordFailed { message });
-            self.handle_event(Event::RecordFailed { why }, None).await;
+            self.handle_event(Event::RecordFailed { reason: why }, None).await;
         }
         self.answer_unrecorded_orders();
     }
@@ -554,7 +556,7 @@ impl Drive {
                         "{message}; only the steps that make the cell safe were carried out, because the order was not recorded: {why}"
                     );
                     // The person who asked may be gone.
-                    drop(answer.send(Reply { taken: false, message, status: status.clone() }));
+                    drop(answer.send(Reply { accepted: false, message, status: status.clone() }));
                 }
                 then => waiting.action = then,
             }
@@ -600,7 +602,7 @@ impl Drive {
     /// Refuses a resume if the state of the cell has changed since the person saw it. Does nothing for the requests
     /// `Status` and `Watch`.
     async fn handle_order(&mut self, ReceivedOrder { request, actor, answer }: ReceivedOrder) {
-        if let Request::Resume { seen: Some(seen), .. } = request
+        if let Request::Resume { state_number: Some(seen), .. } = request
             && seen != self.state_changes
         {
             let message = format!(
@@ -609,7 +611,7 @@ impl Drive {
             );
             // The person who asked may be gone.
             if let Some(answer) = answer {
-                drop(answer.send(Reply { taken: false, message, status: self.snapshot() }));
+                drop(answer.send(Reply { accepted: false, message, status: self.snapshot() }));
             }
             return;
         }
@@ -679,7 +681,7 @@ impl Drive {
                 Err(why) => Err(why),
             };
             let message = told.as_ref().err().unwrap_or(&status.message).clone();
-            let reply = Reply { taken: told.is_ok(), message, status };
+            let reply = Reply { accepted: told.is_ok(), message, status };
             if let Some(answer) = answer {
                 let _ = answer.send(reply);
             }
@@ -760,7 +762,7 @@ impl Drive {
             let payload = json!({ "pass_record": pass_record::pass_record_document(record) });
             self.record_note(RecordKind::Note, ("grinder".into(), "wire".into()), payload);
             if let Some(why) = self.pass_record_flaw(record) {
-                self.handle_event(Event::RecordDoubted { cycle: self.cell.cycle(), why }, None).await;
+                self.handle_event(Event::RecordDoubted { cycle: self.cell.cycle(), reason: why }, None).await;
             }
         }
         if let Some(FetchedResult::Points(measurement, taken)) = fetched {
@@ -816,21 +818,21 @@ impl Drive {
 
     async fn handle_computed(&mut self, computed: ComputationResult) {
         let ComputationResult { cycle: number, event, product, files } = computed;
-        if matches!(&event, Some(Event::Registered { figures, .. }) if figures.touch_on.is_none()) {
+        if matches!(&event, Some(Event::Registered { figures, .. }) if figures.further_touches.is_none()) {
             *self.attempts.entry((number, Computation::FinalRegistration)).or_insert(0) += 1;
         }
         if let (Err(why), Some(Event::Collected { .. } | Event::Registered { .. } | Event::Compensated { .. })) =
             (&files, &event)
         {
             // A result that is not recorded is not used. It is computed again after a person has repaired the disk.
-            let event = Event::NotSaved { cycle: number, why: why.clone() };
+            let event = Event::NotSaved { cycle: number, reason: why.clone() };
             self.notify(Notice::RecordFailed { message: failure_message(why) });
             self.handle_event(event, None).await;
             return;
         }
         self.cycles.store(number, product);
         self.record_files(number, files).await;
-        if let Some(Event::RecordFailed { why }) = &event {
+        if let Some(Event::RecordFailed { reason: why }) = &event {
             self.notify(Notice::RecordFailed { message: failure_message(why) });
         }
         if let Some(event) = event {
@@ -868,7 +870,7 @@ impl Drive {
             self.execute(command.clone()).await;
         }
         let refusal = commands.iter().find_map(|command| match command {
-            Command::Refuse { why, .. } => Some(why.clone()),
+            Command::Refuse { reason: why, .. } => Some(why.clone()),
             _ => None,
         });
         // A refused order changed nothing: only the refusal is shown.
@@ -998,7 +1000,9 @@ impl Drive {
             Command::Announce(judgement) => self.announce(judgement).await,
             Command::Raise(alarm) => self.notify(Notice::Alarm(alarm)),
             Command::Withdraw { alarm } => self.notify(Notice::AlarmGone { alarm }),
-            Command::Refuse { event, why, .. } if event.is_order() => self.notify(Notice::Refused { why }),
+            Command::Refuse { event, reason: why, .. } if event.is_order() => {
+                self.notify(Notice::Refused { reason: why })
+            }
             // A late fact from a machine is recorded, but a person has nothing to do.
             Command::Refuse { .. } => {}
             Command::Finish(ending) => self.ending = Some(ending),
@@ -1074,7 +1078,7 @@ impl Drive {
         let (folder, needed) = (self.folder.clone(), self.task.cycle_bytes().max(2 * self.max_cycle_bytes));
         self.executor.spawn_computation(&mut self.computations, move || {
             let short = require_free_space(&folder, needed).err();
-            let event = short.map(|why| Event::RecordFailed { why });
+            let event = short.map(|why| Event::RecordFailed { reason: why });
             ComputationResult { cycle, event, product: ComputationProduct::Nothing, files: Ok(Vec::new()) }
         });
     }
@@ -1176,7 +1180,7 @@ impl Drive {
     fn state_notice(&self, event: &Event) -> Notice {
         let (state, cycle, at_job) =
             (self.cell.in_words(), self.cell.cycle(), self.progress_estimator.progress().is_some());
-        Notice::State { state, cycle, event: event.name().to_owned(), at_job }
+        Notice::State { state, cycle, event: event.name().to_owned(), has_progress: at_job }
     }
 
     /// Notifies people of `event`, and updates the progress of the job and the preview of the points. Must be called
@@ -1191,8 +1195,8 @@ impl Drive {
                 let cycle = self.cell.cycle();
                 self.progress_estimator.record_progress(now, (*device, cycle), *done, *total);
                 self.progress_estimator.update_state(self.cell.state());
-                let left_s = self.progress_estimator.progress().and_then(|progress| progress.left_s);
-                Notice::Progress { device: *device, cycle, done: *done, total: *total, left_s }
+                let left_s = self.progress_estimator.progress().and_then(|progress| progress.remaining_s);
+                Notice::Progress { device: *device, cycle, done: *done, total: *total, remaining_s: left_s }
             }
             Event::Registered { cycle, figures } => {
                 self.notify(Notice::Figures { cycle: *cycle, figures: figures.clone() });
@@ -1286,6 +1290,6 @@ fn judged_figure(of: &ComparedFigure) -> Value {
         "found_mm": of.median_mm,
         "expanded_mm": of.expanded_mm,
         "limit_mm": Some(of.limit_mm).filter(|limit| limit.is_finite()),
-        "probability_within": of.probability_within,
+        "probability_within": of.probability_in_tolerance,
     })
 }

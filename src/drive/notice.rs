@@ -18,7 +18,7 @@ pub enum Notice {
         event: String,
         /// True if a job of a machine with a progress report is in progress.
         #[serde(skip)]
-        at_job: bool,
+        has_progress: bool,
     },
     /// The right part must be loaded, and the loading confirmed.
     LoadPart,
@@ -37,7 +37,8 @@ pub enum Notice {
         done: u32,
         total: u32,
         #[serde(skip_serializing_if = "Option::is_none")]
-        left_s: Option<[f64; 2]>,
+        #[serde(rename = "left_s")]
+        remaining_s: Option<[f64; 2]>,
     },
     /// The points of a measurement were transferred in `seconds`.
     Transferred { cycle: u32, points: usize, seconds: f64, ms_per_point: f64 },
@@ -52,7 +53,10 @@ pub enum Notice {
     /// An alarm is gone.
     AlarmGone { alarm: AlarmId },
     /// An order or an event did not fit the state.
-    Refused { why: String },
+    Refused {
+        #[serde(rename = "why")]
+        reason: String,
+    },
     /// The journal or a file could not be written.
     RecordFailed {
         #[serde(rename = "words")]

@@ -52,9 +52,9 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
         (C::Compensate { cycle }, E::Compensated { cycle: c, .. } | E::CompensationRefused { cycle: c, .. }) => {
             cycle == c
         }
-        (C::Acknowledge { device }, E::Refused { device: d, what: MachineRequest::Discard, .. }) => device == d,
+        (C::Acknowledge { device }, E::Refused { device: d, request: MachineRequest::Discard, .. }) => device == d,
         (command, E::NotOnRecord { command: name }) => command.name() == *name,
-        (command, E::Refused { device, what, .. }) => machine_request(command) == Some((*device, *what)),
+        (command, E::Refused { device, request: what, .. }) => machine_request(command) == Some((*device, *what)),
         _ => false,
     }
 }
@@ -90,8 +90,8 @@ mod tests {
         assert!(by(Event::Started { device: Device::Grinder, cycle: 2 }));
         assert!(!by(Event::Started { device: Device::Grinder, cycle: 1 }));
         assert!(!by(Event::Started { device: Device::Cmm, cycle: 2 }));
-        assert!(!by(Event::StartUnknown { device: Device::Grinder, cycle: 2, why: String::new() }));
-        let refused = |what| Event::Refused { device: Device::Grinder, what, why: String::new() };
+        assert!(!by(Event::StartUnknown { device: Device::Grinder, cycle: 2, reason: String::new() }));
+        let refused = |what| Event::Refused { device: Device::Grinder, request: what, reason: String::new() };
         assert!(by(refused(MachineRequest::Start)) && !by(refused(MachineRequest::Prepare)));
     }
 }

@@ -91,7 +91,7 @@ pub(super) fn gate_cycle(
         Ok(points) => (GateResult::Passed, ComputationProduct::Points(points)),
         Err(ComputationError::Failed(failure)) => (GateResult::Failed(failure), ComputationProduct::Nothing),
         Err(ComputationError::NotSaved(why)) => {
-            return (Event::NotSaved { cycle: number, why }, ComputationProduct::Nothing);
+            return (Event::NotSaved { cycle: number, reason: why }, ComputationProduct::Nothing);
         }
     };
     (Event::Collected { cycle: number, targets: planned.max(found), found, gate }, product)
@@ -197,7 +197,7 @@ fn gate_points(
     part: Vec<Point>,
     sphere: Vec<Point>,
     (coordinates, temperature_c): (Coordinates, Option<f64>),
-    TouchRecord { tried, of, .. }: TouchRecord,
+    TouchRecord { tried_targets: tried, point_targets: of, .. }: TouchRecord,
 ) -> Result<UsablePoints, GateFailure> {
     if part.is_empty() {
         return Err(GateFailure::NoPart);
@@ -245,9 +245,11 @@ fn probe_noise(rms_mm: f64, points: usize) -> [f64; 2] {
 pub(super) struct TouchRecord {
     simulation: bool,
     /// Targets of each batch, by their positions in the pattern.
-    tried: Vec<Vec<usize>>,
+    #[serde(rename = "tried")]
+    tried_targets: Vec<Vec<usize>>,
     /// Target of each point that was found.
-    of: Vec<usize>,
+    #[serde(rename = "of")]
+    point_targets: Vec<usize>,
 }
 
 impl TouchRecord {
@@ -266,7 +268,7 @@ impl TouchRecord {
             of.extend(found.map(|(_, target)| *target));
             tried.push(asked.to_vec());
         }
-        Self { simulation: false, tried, of }
+        Self { simulation: false, tried_targets: tried, point_targets: of }
     }
 }
 
@@ -424,9 +426,11 @@ pub(super) fn register_cycle(
             (event, ComputationProduct::Registered(Box::new(found)))
         }
         Err(ComputationError::Failed(why)) => {
-            (Event::RegistrationFailed { cycle: number, why }, ComputationProduct::Nothing)
+            (Event::RegistrationFailed { cycle: number, reason: why }, ComputationProduct::Nothing)
         }
-        Err(ComputationError::NotSaved(why)) => (Event::NotSaved { cycle: number, why }, ComputationProduct::Nothing),
+        Err(ComputationError::NotSaved(why)) => {
+            (Event::NotSaved { cycle: number, reason: why }, ComputationProduct::Nothing)
+        }
     }
 }
 
@@ -509,7 +513,7 @@ fn register_and_evaluate(
     let offered: Vec<String> = parameters.iter().flat_map(offered_messages).collect();
     let set = match &parameters {
         Some(told) => cycle_output::next_parameter_corrections(task, cycle, &contacts, told),
-        None => cycle.correction.set.clone(),
+        None => cycle.correction.parameters.clone(),
     };
     let known = error.as_ref().map(|error| update_learning(task, cycle, before, error, (answer, &contacts)));
     let forecast =
@@ -528,9 +532,9 @@ fn register_and_evaluate(
     if next.is_none() {
         figures.warnings.extend(form.as_ref().err().map(untold));
     }
-    figures.touch_on = next
+    figures.further_touches = next
         .as_ref()
-        .map(|(next, why)| Box::new(FurtherTouches { targets: next.len() as u32, why: (*why).to_owned() }));
+        .map(|(next, why)| Box::new(FurtherTouches { target_count: next.len() as u32, reason: (*why).to_owned() }));
     if next.is_some() && form.is_err() {
         // The first few touches have six motions fitted: their residuals say nothing about the form.
         figures.form = None;
@@ -544,15 +548,15 @@ fn register_and_evaluate(
     } else {
         adaptive_measurement::plan_repeated_touches(task, &found, points, noise_sigma_mm)
     };
-    if let Some(left_out) = figures.left_out.as_mut() {
-        left_out.again = again.is_some();
+    if let Some(left_out) = figures.with_outliers.as_mut() {
+        left_out.can_repeat = again.is_some();
     }
     // Before a person is called, the machine checks the touches by repeating them.
     let again = again.filter(|_| task.tolerance.outliers_decide(&figures));
     if let Some(again) = again.as_ref().filter(|_| points.repeat_rounds == 0) {
         let targets = again.targets.len() as u32;
         let why = "a touch is an outlier, so this touch is repeated, with a few touches near the same place".to_owned();
-        figures.touch_on = Some(Box::new(FurtherTouches { targets, why }));
+        figures.further_touches = Some(Box::new(FurtherTouches { target_count: targets, reason: why }));
     }
     let field = next.is_none().then(|| form.as_ref().ok()?.hyperparameters_without_prior).flatten();
     Ok(RegistrationProduct {
@@ -649,9 +653,9 @@ fn cell_figures(
     };
     let by_points = RecordedFormFigures {
         pv: pv_about(verdict.pv_mm),
-        pv_robust: pv_about(pv_robust_mm.unwrap_or(verdict.pv_mm)),
+        pv_998: pv_about(pv_robust_mm.unwrap_or(verdict.pv_mm)),
         rms: rms_without_noise(scatter_mm, verdict),
-        scatter_mm,
+        noise_sigma_mm: scatter_mm,
     };
     let told = form.map_or(by_points, |form| cell_form_figures(&form.figures, scatter_mm));
     // The forecast must be of the same figure: the filtered map still contains the noise of the probe, and the part
@@ -659,7 +663,7 @@ fn cell_figures(
     let bare = |mm: f64| subtract_in_quadrature(scatter_mm, mm);
     Figures {
         pv_mm: verdict.pv_mm,
-        pv_robust_mm,
+        pv_998_mm: pv_robust_mm,
         rms_mm: verdict.rms_mm,
         form: Some(told),
         pv_expanded_mm,
@@ -667,14 +671,19 @@ fn cell_figures(
         coverage: verdict.coverage,
         points: verdict.inliers as u32,
         outliers,
-        left_out: found.figures_with_outliers().map(|of| {
-            Box::new(OutlierFigures { pv_mm: of.pv_mm, rms_mm: of.rms_mm, places: of.description, again: false })
+        with_outliers: found.figures_with_outliers().map(|of| {
+            Box::new(OutlierFigures {
+                pv_mm: of.pv_mm,
+                rms_mm: of.rms_mm,
+                description: of.description,
+                can_repeat: false,
+            })
         }),
         shift_mm: moved.translation_mm.norm(),
-        turn_rad: moved.angle_rad(),
-        weak_directions: verdict.weak_directions.iter().map(|w| w.words.clone()).collect(),
+        rotation_rad: moved.angle_rad(),
+        weak_directions: verdict.weak_directions.iter().map(|w| w.description.clone()).collect(),
         warnings: verdict.warnings.clone(),
-        response: answer.map(|answer| cell_response(answer.sense)),
+        response: answer.map(|answer| cell_response(answer.kind)),
         forecast: forecast.map(|f| Forecast {
             rms_mm: bare(f.rms_mm),
             sigma_mm: f.sigma_mm,
@@ -682,7 +691,7 @@ fn cell_figures(
         }),
         removed_mm: Some(task.correction_limits.allowance_mm - cycle.correction.level_mm),
         unstated: form.and_then(|form| unstated_contributions(task, form)),
-        touch_on: None,
+        further_touches: None,
     }
 }
 
@@ -721,7 +730,12 @@ fn cell_form_figures(of: &model::FormFigures, scatter_mm: f64) -> RecordedFormFi
         let model::Interval { median_mm, low_mm, high_mm, quantiles_mm, .. } = of;
         RecordedInterval { median_mm, low_mm, high_mm, quantiles_mm: Some(quantiles_mm) }
     };
-    RecordedFormFigures { pv: interval(of.pv), pv_robust: interval(of.pv_998), rms: interval(of.rms), scatter_mm }
+    RecordedFormFigures {
+        pv: interval(of.pv),
+        pv_998: interval(of.pv_998),
+        rms: interval(of.rms),
+        noise_sigma_mm: scatter_mm,
+    }
 }
 
 /// Returns the interval (k = 2) in mm of F, the root mean square of the form without the noise of the probe.
@@ -778,9 +792,11 @@ pub(super) fn compensate_cycle(
     match compute_correction(task, files, cycle) {
         Ok((summary, next)) => (Event::Compensated { cycle: number, summary }, ComputationProduct::Correction(next)),
         Err(ComputationError::Failed(why)) => {
-            (Event::CompensationRefused { cycle: number, why }, ComputationProduct::Nothing)
+            (Event::CompensationRefused { cycle: number, reason: why }, ComputationProduct::Nothing)
         }
-        Err(ComputationError::NotSaved(why)) => (Event::NotSaved { cycle: number, why }, ComputationProduct::Nothing),
+        Err(ComputationError::NotSaved(why)) => {
+            (Event::NotSaved { cycle: number, reason: why }, ComputationProduct::Nothing)
+        }
     }
 }
 
@@ -827,21 +843,21 @@ fn compute_correction(
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let told = cycle.figures.as_ref().and_then(|figures| figures.form);
     let [pv_mm, rms_mm, scatter_mm] = told.map_or([found.quality.pv_mm, found.quality.rms_mm, 0.0], |form| {
-        [form.pv_robust.median_mm, form.rms.median_mm, form.scatter_mm]
+        [form.pv_998.median_mm, form.rms.median_mm, form.noise_sigma_mm]
     });
     let expected_mm = subtract_in_quadrature(scatter_mm, known.forecast(&map, task.scallops_rms_mm()).rms_mm);
     let summary = CompensationSummary {
-        largest_mm,
+        max_correction_mm: largest_mm,
         depth_mm: step.depth_mm,
         predicted_pv_mm: expected_mm * pv_mm / rms_mm.max(f64::MIN_POSITIVE),
         predicted_rms_mm: expected_mm,
         air_share: step.air_share,
         gains: known.gains(),
-        response: known.response()[0],
+        responded_share: known.response()[0],
         warnings: warning.into_iter().collect(),
         map_rms_mm: task.parameter_compensation.as_ref().map(|_| rms(&step.correction.values_mm)),
         parameters: recorded_parameters(task, cycle),
-        asks: parameter_questions(cycle),
+        confirmations_required: parameter_questions(cycle),
     };
     Ok((summary, step.correction))
 }
@@ -858,11 +874,11 @@ pub(super) fn recorded_parameters(task: &Task, cycle: &CycleState) -> Vec<Record
         RecordedParameter {
             name: p.kind.name().to_owned(),
             unit: p.kind.unit().to_owned(),
-            off: units * p.value,
-            expanded: 2.0 * units * p.sigma,
-            taken: units * p.compensated,
-            told: units * cycle.parameter_corrections.as_ref().map_or(0.0, |set| set.values[k]),
-            removes_rms_um: 1e3 * p.rms_reduction_mm,
+            estimate: units * p.value,
+            expanded_uncertainty: 2.0 * units * p.sigma,
+            compensated: units * p.compensated,
+            total_correction: units * cycle.parameter_corrections.as_ref().map_or(0.0, |set| set.values[k]),
+            rms_reduction_um: 1e3 * p.rms_reduction_mm,
         }
     };
     wanted.map(told).collect()
@@ -949,7 +965,10 @@ fn write_measured_points(task: &Task, files: &mut OutputFiles, points: &UsablePo
     }
     if !points.tried_targets.is_empty() {
         let (tried, of) = (points.tried_targets.clone(), points.point_targets.clone());
-        write_json_atomic(files.add_file(TOUCHES_FILE), &TouchRecord { simulation: task.simulation, tried, of })?;
+        write_json_atomic(
+            files.add_file(TOUCHES_FILE),
+            &TouchRecord { simulation: task.simulation, tried_targets: tried, point_targets: of },
+        )?;
     }
     let header = if task.simulation { "# SIMULATION\nx_mm,y_mm,z_mm" } else { "x_mm,y_mm,z_mm" };
     if !points.sphere.is_empty() {

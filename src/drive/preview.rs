@@ -55,7 +55,7 @@ impl PreviewAccumulator {
     pub(super) fn statistics(&self) -> Option<PreviewStatistics> {
         let [least, most] = self.range_mm?;
         let rms_um = 1e3 * (self.square_sum_mm2 / f64::from(self.touch_count)).sqrt();
-        Some(PreviewStatistics { touched: self.touch_count, rms_um, least_um: 1e3 * least, most_um: 1e3 * most })
+        Some(PreviewStatistics { touch_count: self.touch_count, rms_um, min_um: 1e3 * least, max_um: 1e3 * most })
     }
 }
 
@@ -112,9 +112,9 @@ mod tests {
         rest.points[1].status = TouchStatus::NotFound;
         touching.add_points(&plan(), &rest);
         let told = touching.statistics().unwrap();
-        assert_eq!(told.touched, 2);
+        assert_eq!(told.touch_count, 2);
         let near = |found: f64, is: f64| (found - is).abs() < 1e-9;
-        assert!(near(told.least_um, -4.0) && near(told.most_um, 3.0) && near(told.rms_um, 12.5_f64.sqrt()), "{told:?}");
+        assert!(near(told.min_um, -4.0) && near(told.max_um, 3.0) && near(told.rms_um, 12.5_f64.sqrt()), "{told:?}");
     }
 
     #[test]
@@ -132,7 +132,7 @@ mod tests {
             assert_eq!(touching.statistics(), None, "{wrong:?}");
             // Given from the beginning they count again.
             touching.add_points(&plan(), &centres(0, &[0.5, 0.003]));
-            assert_eq!(touching.statistics().map(|told| told.touched), Some(1));
+            assert_eq!(touching.statistics().map(|told| told.touch_count), Some(1));
         }
     }
 }

@@ -162,7 +162,7 @@ impl Programs {
 
     /// Returns the estimated wheel radius minus the radius in the recipe, in mm; 0 if it is not estimated.
     fn wheel_radius_error_mm(&self, correction: &Correction) -> f64 {
-        correction.set.as_ref().map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
+        correction.parameters.as_ref().map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
 
     /// Plans the path of a pass and writes its program to `file`. Returns the summary of the path. `map_identity` is
@@ -296,7 +296,7 @@ impl Programs {
 /// part. The error of the wheel radius is not added, because [`Programs::path`] plans the path with the corrected
 /// radius.
 fn path_correction(correction: &Correction) -> Cow<'_, Correction> {
-    match &correction.set {
+    match &correction.parameters {
         None => Cow::Borrowed(correction),
         Some(_) => Cow::Owned(Correction { values_mm: correction.map_mm().into_owned(), ..correction.clone() }),
     }
@@ -306,7 +306,7 @@ fn path_correction(correction: &Correction) -> Cow<'_, Correction> {
 /// since which it is compensated, and whether the map or the wheel radius compensates it. `wheel_radius_mm` is the
 /// radius in the recipe. Returns an empty list if no parameter is compensated.
 pub(super) fn describe_parameter_corrections(correction: &Correction, wheel_radius_mm: f64) -> Vec<String> {
-    let Some(set) = &correction.set else { return Vec::new() };
+    let Some(set) = &correction.parameters else { return Vec::new() };
     let taken = ParameterKind::ALL.into_iter().zip(set.values).filter(|(_, value)| *value != 0.0);
     let line = |(kind, value): (ParameterKind, f64)| {
         let said = format!("{}: off by {:.3} {}", kind.name(), kind.display_units_per_unit() * value, kind.unit());

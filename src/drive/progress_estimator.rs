@@ -63,7 +63,7 @@ impl ProgressEstimator {
     pub(super) fn progress(&self) -> Option<JobProgress> {
         let (device, _) = self.job?;
         let (done, total) = self.done_and_total;
-        Some(JobProgress { device, done, total, left_s: self.remaining_s() })
+        Some(JobProgress { device, done, total, remaining_s: self.remaining_s() })
     }
 
     fn remaining_s(&self) -> Option<[f64; 2]> {
@@ -102,7 +102,7 @@ mod tests {
         }
         let told = pace.progress().unwrap();
         assert_eq!((told.device, told.done, told.total), (Device::Grinder, 500, 1000));
-        let [least, most] = told.left_s.unwrap();
+        let [least, most] = told.remaining_s.unwrap();
         assert!((least - 50.0).abs() < 1e-9 && (most - 50.0).abs() < 1e-9, "{least} to {most}");
         assert!(pace.marks.len() <= MAX_MARKS && pace.marks[0] == (ms(0), 0), "{:?}", pace.marks);
     }
@@ -116,7 +116,7 @@ mod tests {
         for k in 0..20_u32 {
             pace.record_progress(ms(10_000 + 1_000 * u64::from(k)), JOB, 100 + k, 200);
         }
-        let [least, most] = pace.progress().unwrap().left_s.unwrap();
+        let [least, most] = pace.progress().unwrap().remaining_s.unwrap();
         assert!(least < 30.0 && most > 70.0, "{least} to {most}");
     }
 
@@ -128,16 +128,16 @@ mod tests {
         }
         pace.update_state(State::Held(Phase::Grind(JobStep::Run)));
         let held = pace.progress().unwrap();
-        assert_eq!((held.done, held.left_s), (19, None));
+        assert_eq!((held.done, held.remaining_s), (19, None));
         // The hour of standstill does not count.
         pace.update_state(RUNNING);
         pace.record_progress(ms(3_600_000), JOB, 20, 100);
-        assert_eq!(pace.progress().unwrap().left_s, None, "no pace yet");
+        assert_eq!(pace.progress().unwrap().remaining_s, None, "no pace yet");
         pace.record_progress(ms(3_601_000), JOB, 30, 100);
-        assert_eq!(pace.progress().unwrap().left_s, Some([7.0, 7.0]));
+        assert_eq!(pace.progress().unwrap().remaining_s, Some([7.0, 7.0]));
         // The same machine runs its next job.
         pace.record_progress(ms(3_602_000), (Device::Grinder, 2), 1, 100);
-        assert_eq!(pace.progress().unwrap().left_s, None);
+        assert_eq!(pace.progress().unwrap().remaining_s, None);
         pace.update_state(State::Execute(Phase::Transfer));
         assert_eq!(pace.progress(), None);
     }
@@ -147,6 +147,6 @@ mod tests {
         let mut pace = ProgressEstimator::default();
         pace.record_progress(ms(0), JOB, 0, 0);
         pace.record_progress(ms(1000), JOB, 0, 0);
-        assert_eq!(pace.progress().unwrap().left_s, None);
+        assert_eq!(pace.progress().unwrap().remaining_s, None);
     }
 }

@@ -301,7 +301,7 @@ impl<'t> Replay<'t> {
             ),
             _ => pipeline::compensate_cycle(self.task, &mut files, number, &cycle),
         };
-        if let Event::NotSaved { why, .. } = again {
+        if let Event::NotSaved { reason: why, .. } = again {
             let what = super::failure_message(&why);
             return Err(ReplayError::NotSaved { run: self.run_folder.to_owned(), what });
         }

@@ -333,7 +333,7 @@ impl<B: StationDriver> MachineTask<B> {
         let (reports, name) = (self.reports.clone(), B::DEVICE);
         let Err(error) = tokio::spawn(self.serve_requests(asks, poll, aborts, pulse)).await else { return };
         let why = format!("a fault of the program Regrind; report this fault: {}", panic_message(error));
-        let event = Some(Event::StationFailed { device: name, why });
+        let event = Some(Event::StationFailed { device: name, reason: why });
         let _ = reports.send(StationReport { event, ..StationReport::default() }).await;
     }
 
@@ -438,7 +438,7 @@ impl<B: StationDriver> MachineTask<B> {
         };
         match connected.await {
             Ok((_, Err(found))) => {
-                self.report(Event::NotConnected { device: B::DEVICE, why: ConnectionRefusal::AtAnotherJob(found) })
+                self.report(Event::NotConnected { device: B::DEVICE, reason: ConnectionRefusal::AtAnotherJob(found) })
                     .await;
             }
             Ok((identity, Ok(status))) => {
@@ -447,9 +447,13 @@ impl<B: StationDriver> MachineTask<B> {
                 let found = self.occupation(&status).await;
                 let (device, boot_id, simulated) = (B::DEVICE, identity.boot_id, identity.simulation);
                 let detail = serde_json::json!({ "name": identity.name, "address": self.driver.machine().name() });
-                self.report_with_detail(Event::Connected { device, boot_id, simulated, found }, Some(detail)).await;
+                self.report_with_detail(
+                    Event::Connected { device, boot_id, simulated, occupation: found },
+                    Some(detail),
+                )
+                .await;
             }
-            Err(error) => self.report(Event::NotConnected { device: B::DEVICE, why: mismatch(&error) }).await,
+            Err(error) => self.report(Event::NotConnected { device: B::DEVICE, reason: mismatch(&error) }).await,
         }
     }
 
@@ -513,7 +517,9 @@ impl<B: StationDriver> MachineTask<B> {
         self.armed = None;
         let Some(digest) = self.loaded_digest else {
             let why = "no payload was loaded".to_owned();
-            return self.report(Event::Refused { device: B::DEVICE, what: MachineRequest::Prepare, why }).await;
+            return self
+                .report(Event::Refused { device: B::DEVICE, request: MachineRequest::Prepare, reason: why })
+                .await;
         };
         let job = Job { job: self.job, cycle: number.encode(), digest };
         let prepared = async {
@@ -539,7 +545,9 @@ impl<B: StationDriver> MachineTask<B> {
         let armed = self.armed.clone().filter(|armed| armed.job.batch_id().cycle == cycle);
         let Some(armed) = armed else {
             let why = "it is not prepared".to_owned();
-            return self.report(Event::Refused { device: B::DEVICE, what: MachineRequest::Start, why }).await;
+            return self
+                .report(Event::Refused { device: B::DEVICE, request: MachineRequest::Start, reason: why })
+                .await;
         };
         if self.observed.link_lost {
             return self.refuse_unsent(MachineRequest::Start).await;
@@ -568,7 +576,7 @@ impl<B: StationDriver> MachineTask<B> {
             }
             // After any other error, the machine may have received the START.
             Err(error) => {
-                self.report(Event::StartUnknown { device: B::DEVICE, cycle, why: error.to_string() }).await;
+                self.report(Event::StartUnknown { device: B::DEVICE, cycle, reason: error.to_string() }).await;
             }
         }
     }
@@ -577,7 +585,7 @@ impl<B: StationDriver> MachineTask<B> {
     /// it. It is not sent later either, so it cannot move the machine.
     async fn refuse_unsent(&mut self, what: MachineRequest) {
         let why = "the link is lost, so the command was not sent".to_owned();
-        self.report(Event::Refused { device: B::DEVICE, what, why }).await;
+        self.report(Event::Refused { device: B::DEVICE, request: what, reason: why }).await;
     }
 
     async fn hold(&mut self) {
@@ -632,7 +640,7 @@ impl<B: StationDriver> MachineTask<B> {
             && let Err(why) = self.connect_for_abort().await
         {
             let device = B::DEVICE;
-            return self.report(Event::Refused { device, what: MachineRequest::Abort, why }).await;
+            return self.report(Event::Refused { device, request: MachineRequest::Abort, reason: why }).await;
         }
         match self.driver.machine().abort().await {
             Ok(status) => self.report_changes(&status).await,
@@ -711,7 +719,9 @@ impl<B: StationDriver> MachineTask<B> {
         let Some(job) = armed.map(|armed| armed.job) else {
             let why = "Regrind has not prepared the machine for a job of this cycle, so there is no result to collect"
                 .to_owned();
-            return self.report(Event::Refused { device: B::DEVICE, what: MachineRequest::Collect, why }).await;
+            return self
+                .report(Event::Refused { device: B::DEVICE, request: MachineRequest::Collect, reason: why })
+                .await;
         };
         match self.driver.fetch(job, &self.interrupt).await {
             // The drive checks the points and reports to the cell; this only hands them over.
@@ -744,7 +754,7 @@ impl<B: StationDriver> MachineTask<B> {
             Ok(status) if status.state.is_moving() || status.state == MachineState::Held => {
                 let (device, why) =
                     (B::DEVICE, format!("{} is still {}", self.driver.machine().name(), describe_job(&status)));
-                self.report(Event::Refused { device, what: MachineRequest::Discard, why }).await;
+                self.report(Event::Refused { device, request: MachineRequest::Discard, reason: why }).await;
             }
             Ok(status) => {
                 self.observed.state = Some(status.state);
@@ -766,7 +776,7 @@ impl<B: StationDriver> MachineTask<B> {
                 let (device, message) = (B::DEVICE, fault_message(B::DEVICE, fault));
                 self.report(Event::Fault { device, code: fault.number(), message }).await;
             }
-            _ => self.report(Event::Refused { device: B::DEVICE, what, why: error.to_string() }).await,
+            _ => self.report(Event::Refused { device: B::DEVICE, request: what, reason: error.to_string() }).await,
         }
     }
 
@@ -782,7 +792,7 @@ impl<B: StationDriver> MachineTask<B> {
             } else {
                 "the machine answers, but its answer contradicts the cell file or docs/modbus.md: "
             };
-            self.report(Event::LinkLost { device: B::DEVICE, why: format!("{answers}{error}") }).await;
+            self.report(Event::LinkLost { device: B::DEVICE, reason: format!("{answers}{error}") }).await;
         }
     }
 
@@ -885,7 +895,7 @@ impl<B: StationDriver> MachineTask<B> {
             MachineState::Idle if self.observed.clearing => {
                 self.observed.clearing = false;
                 let (device, boot_id) = (B::DEVICE, status.boot_id.unwrap_or_default());
-                self.report(Event::Connected { device, boot_id, simulated: false, found: Occupation::Idle }).await;
+                self.report(Event::Connected { device, boot_id, simulated: false, occupation: Occupation::Idle }).await;
             }
             MachineState::Aborted => self.report_abort(before).await,
             MachineState::Faulted if before != Some(MachineState::Faulted) => {
@@ -917,7 +927,8 @@ impl<B: StationDriver> MachineTask<B> {
         }
         self.observed.reads_without_job += 1;
         if self.observed.reads_without_job == VANISHED_AFTER_READS {
-            self.report(Event::JobVanished { device: B::DEVICE, why: format!("it is {}", describe_job(status)) }).await;
+            self.report(Event::JobVanished { device: B::DEVICE, reason: format!("it is {}", describe_job(status)) })
+                .await;
         }
     }
 
@@ -937,7 +948,7 @@ impl<B: StationDriver> MachineTask<B> {
                 {
                     let why =
                         format!("the machine reports HELD, but the progress of the job has risen to {done} of {total}");
-                    self.report(Event::Refused { device, what: MachineRequest::Hold, why }).await;
+                    self.report(Event::Refused { device, request: MachineRequest::Hold, reason: why }).await;
                 }
             }
             None => self.observed.progress_rises_at_held = 0,
@@ -946,7 +957,7 @@ impl<B: StationDriver> MachineTask<B> {
         if self.observed.stopping && is_late && status.state == MachineState::Execute {
             self.observed.stop_accepted_at = None;
             let why = format!("the machine accepted STOP, but is still in EXECUTE {} s later", STOP_TIMEOUT.as_secs());
-            self.report(Event::Refused { device, what: MachineRequest::Stop, why }).await;
+            self.report(Event::Refused { device, request: MachineRequest::Stop, reason: why }).await;
         }
     }
 
@@ -960,7 +971,7 @@ impl<B: StationDriver> MachineTask<B> {
         };
         if f64::from(done) < MIN_COMPLETE_SHARE * f64::from(total) {
             let why = format!("the grinder reports the pass as complete, but the progress is only {done} of {total}");
-            self.report(Event::RecordDoubted { cycle: self.cycle, why }).await;
+            self.report(Event::RecordDoubted { cycle: self.cycle, reason: why }).await;
         }
     }
 
@@ -1076,7 +1087,7 @@ impl<B: StationDriver> MachineTask<B> {
                 self.report_link_lost(&error).await;
                 return Err(());
             }
-            Err(error) => self.report(Event::RecordDoubted { cycle: self.cycle, why: error.to_string() }).await,
+            Err(error) => self.report(Event::RecordDoubted { cycle: self.cycle, reason: error.to_string() }).await,
         }
         Ok(())
     }

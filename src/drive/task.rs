@@ -151,7 +151,7 @@ impl AdaptiveOptions {
     /// `may_grind` is true if another pass of the grinder is allowed. The measurement must then also be exact enough to
     /// compute a correction.
     pub fn stopping_criteria(&self, may_grind: bool) -> StoppingCriteria {
-        let Tolerance { pv_mm, rms_mm, pv_of, .. } = self.tolerance;
+        let Tolerance { pv_mm, rms_mm, pv_points: pv_of, .. } = self.tolerance;
         let (pv_mm, pv_most_points_mm) = match pv_of {
             PvPoints::All => (pv_mm, f64::INFINITY),
             PvPoints::MostPoints => (f64::INFINITY, pv_mm),
@@ -497,7 +497,7 @@ impl Task {
         let method = if probe_radius_mm == 0.0 { Method::Contact } else { self.registration_options.method };
         let options = RegistrationOptions { probe_radius_mm, method, start, ..self.registration_options };
         let found = register(&self.nominal, points, &options)?;
-        if start_at_fixture || !found.quality.weak_directions.iter().any(|weak| weak.held) {
+        if start_at_fixture || !found.quality.weak_directions.iter().any(|weak| weak.is_undetermined) {
             return Ok((found, options));
         }
         let options = RegistrationOptions { start: at_fixture, ..options };
@@ -554,7 +554,7 @@ impl Task {
             values_mm: correction.map_mm().into_owned(),
             part_identity: self.part_identity,
         };
-        let wheel_radius_mm = self.wheel_radius_mm(correction.set.as_ref());
+        let wheel_radius_mm = self.wheel_radius_mm(correction.parameters.as_ref());
         let pass = Pass { level_mm: correction.level_mm, part_identity: self.part_identity, ..self.pass };
         (map, Pass { wheel_radius_mm, ..pass })
     }

@@ -154,7 +154,7 @@ impl<'a> RegistrationDocument<'a> {
             warnings: &verdict.warnings,
             converged: verdict.converged,
             iterations: verdict.iterations,
-            objective_mm2: registration.trace.iter().filter(|i| i.taken).map(|i| i.objective_mm2).collect(),
+            objective_mm2: registration.trace.iter().filter(|i| i.accepted).map(|i| i.objective_mm2).collect(),
             points: registration.deviations.len(),
             used: verdict.inliers,
             rms_mm: verdict.rms_mm,

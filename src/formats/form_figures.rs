@@ -79,7 +79,7 @@ pub(super) fn form_figure_rows(
             row(name, values, raw_rad.map(|rad| 1e6 * rad), "urad", &made)
         };
         rows.push(urad("slope RMS", of.rms, slope.map(|raw| raw.rms_rad)));
-        rows.push(urad("slope, largest", of.largest, slope.map(|raw| raw.largest_rad)));
+        rows.push(urad("slope, largest", of.max, slope.map(|raw| raw.max_rad)));
     }
     if let Some(of) = form.iso {
         let raw = raw.map(|raw| &raw.iso_10110);

@@ -42,8 +42,8 @@ pub struct Learned {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub kind: Option<String>,
     /// Cells that the knowledge comes from, if it is from other cells and not from a run of this one.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub taught_by: Option<KnowledgeOrigin>,
+    #[serde(rename = "taught_by", default, skip_serializing_if = "Option::is_none")]
+    pub origin: Option<KnowledgeOrigin>,
 }
 
 /// Origin of the knowledge that a first part begins with.
@@ -53,7 +53,8 @@ pub struct KnowledgeOrigin {
     pub runs: Vec<CellRun>,
     /// For each band of wavelengths that was taken over: its shortest wavelength, in millimetres, and the rms share of
     /// the repeatable error in it that is assumed to be specific to a machine.
-    pub differ: Vec<[f64; 2]>,
+    #[serde(rename = "differ")]
+    pub machine_difference: Vec<[f64; 2]>,
     /// Number of comparisons between machines on which this is based.
     pub comparisons: usize,
 }
@@ -97,7 +98,7 @@ impl Learned {
     /// passes were simulated.
     pub fn new(simulation: bool, setting: String, run: String, correction: Correction, known: LearningState) -> Self {
         let (fields, kind, taught_by) = (PartPriors::default(), None, None);
-        Self { layout: LAYOUT, simulation, setting, run, correction, known, fields, kind, taught_by }
+        Self { layout: LAYOUT, simulation, setting, run, correction, known, fields, kind, origin: taught_by }
     }
 
     /// Predicts the knowledge (the learned correction and the state of the learning) for the first part of a recipe on
@@ -125,9 +126,9 @@ impl Learned {
         let fields: Vec<PartPriors> = others.iter().map(|(_, other)| other.fields).collect();
         let named: Vec<String> = runs.iter().map(|CellRun { cell, run }| format!("{run} of {cell}")).collect();
         let correction = none.compensating(&known, None);
-        let taught_by = Some(KnowledgeOrigin { runs, differ, comparisons: alike.comparisons() });
+        let taught_by = Some(KnowledgeOrigin { runs, machine_difference: differ, comparisons: alike.comparisons() });
         let learned = Self::new(simulation, setting, named.join(" and "), correction, known);
-        Some(Self { taught_by, ..learned.with_fields(PartPriors::pooled(&fields)) })
+        Some(Self { origin: taught_by, ..learned.with_fields(PartPriors::pooled(&fields)) })
     }
 
     /// Returns this knowledge of a run with `kind` stored in it. `kind` is a text of those settings of the run that do
@@ -193,7 +194,7 @@ impl Learned {
         let is_meant = learned.layout == LAYOUT
             && learned.kind.as_deref() == Some(kind)
             && learned.simulation == simulation
-            && learned.taught_by.is_none();
+            && learned.origin.is_none();
         let broken = |why| Err(LearnedError::Broken { path: from.to_owned(), why });
         match learned.known.transfer_obstacle() {
             _ if !is_meant => broken("the knowledge is for another kind of parts than this recipe".into()),
@@ -233,7 +234,7 @@ impl Learned {
         if !values_mm.iter().all(|v| v.is_finite()) || !level_mm.is_finite() {
             return Some("a number of its correction is not finite".into());
         }
-        if self.correction.set.as_ref().is_some_and(|set| !set.is_valid(grid.len())) {
+        if self.correction.parameters.as_ref().is_some_and(|set| !set.is_valid(grid.len())) {
             return Some("a parameter of its correction is impossible, or belongs to another grid".into());
         }
         if !self.fields.is_valid() {
@@ -249,14 +250,14 @@ impl Learned {
     /// (the height of the target surface above the nominal surface) of `none`.
     pub fn first_correction(&self, none: Correction) -> Correction {
         let on_grid = |values: &Vec<f64>| self.correction.grid.resample(values, &none.grid);
-        let set = self.correction.set.as_ref().map(|set| ParameterCorrections {
-            displaced_mm: on_grid(&set.displaced_mm),
+        let set = self.correction.parameters.as_ref().map(|set| ParameterCorrections {
+            displacement_mm: on_grid(&set.displacement_mm),
             setting_mm: on_grid(&set.setting_mm),
-            seen_mm: on_grid(&set.seen_mm),
+            apparent_mm: on_grid(&set.apparent_mm),
             since_cycle: none.cycle,
             ..*set
         });
-        Correction { values_mm: on_grid(&self.correction.values_mm), set, ..none }
+        Correction { values_mm: on_grid(&self.correction.values_mm), parameters: set, ..none }
     }
 }
 
@@ -320,12 +321,12 @@ mod tests {
         let none = Correction::zero(GRID, 0.05);
         let begun = Learned::from_others(&others, &alike, (true, "mine".into()), (&fresh, none.clone())).unwrap();
         assert_eq!(begun.run, "run-cell-1 of cell-1 and run-cell-3 of cell-3");
-        let told = begun.taught_by.as_ref().unwrap();
+        let told = begun.origin.as_ref().unwrap();
         assert_eq!((told.runs.len(), told.comparisons), (2, 1));
         // The saved copy can be read back, and is not mistaken for the result of a run.
         let text = serde_json::to_vec(&begun).unwrap();
         let back = Learned::from_saved(Path::new("kept"), &text).unwrap();
-        assert_eq!((&back.correction, &back.taught_by), (&begun.correction, &begun.taught_by));
+        assert_eq!((&back.correction, &back.origin), (&begun.correction, &begun.origin));
         let kind = serde_json::to_vec(&begun.with_kind("such parts".into())).unwrap();
         assert!(Learned::read_other(Path::new("there"), &kind, "such parts", true).is_err());
         assert!(Learned::from_others(&[], &alike, (true, "mine".into()), (&fresh, none)).is_none());

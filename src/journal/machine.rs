@@ -110,7 +110,7 @@ impl MachineLock {
         let path = place.join(FOLDER);
         let folder = LockFolder::open(place, FOLDER).map_err(|bad| JournalError::LockFolder {
             path: path.clone(),
-            what: bad.what,
+            what: bad.description,
             remedy: bad.remedy,
         })?;
         let machine = &sha256_hex(address.as_bytes())[..16];

@@ -154,7 +154,7 @@ pub const FIGURES: &[Figure] = &[
         told.snapshot().map(|now| FigureValue::Whole(u32::try_from(now.alarms.len()).unwrap_or(u32::MAX)))
     }),
     text("Alarms/Text", "Texts of the active alarms, one on each line; empty without an alarm", |told| {
-        told.snapshot().map(|now| listed(now.alarms.iter().map(|alarm| &*alarm.what), "\n"))
+        told.snapshot().map(|now| listed(now.alarms.iter().map(|alarm| &*alarm.event), "\n"))
     }),
     text(
         "Unconfirmed",
@@ -189,7 +189,7 @@ fn job(told: &CellStatus) -> Option<JobProgress> {
 }
 
 fn time_left_s(told: &CellStatus, which: usize) -> Option<FigureValue> {
-    job(told)?.left_s.map(|left_s| FigureValue::Number(left_s[which]))
+    job(told)?.remaining_s.map(|left_s| FigureValue::Number(left_s[which]))
 }
 
 fn measured(told: &CellStatus) -> Option<&CycleRow> {
@@ -240,7 +240,7 @@ mod tests {
             rms_mm: 1e-3,
             with_uncertainty: false,
             probability: 0.975,
-            pv_of: regrind_cell::PvPoints::All,
+            pv_points: regrind_cell::PvPoints::All,
         };
         let told = on(Snapshot { tolerance: Some(limits), ..Snapshot::default() });
         assert_eq!(value("Limits/PV", &told), None, "it is not limited");

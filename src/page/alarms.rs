@@ -9,7 +9,7 @@ use super::texts::Language;
 /// Texts of an alarm in one language.
 pub(crate) struct AlarmTexts<'a> {
     /// Cause of the alarm, with its values.
-    pub(crate) what: Cow<'a, str>,
+    pub(crate) event: Cow<'a, str>,
     /// Consequence of the alarm.
     pub(crate) consequence: &'a str,
     /// Remedy, as steps in this order.
@@ -21,10 +21,10 @@ pub(crate) struct AlarmTexts<'a> {
 pub(crate) fn alarm_texts(alarm: &Alarm, language: Language) -> AlarmTexts<'_> {
     let Some((head, consequence, remedy)) = translated(alarm.id, language) else {
         let remedy = alarm.remedy.iter().map(String::as_str).collect();
-        return AlarmTexts { what: Cow::Borrowed(&alarm.what), consequence: &alarm.consequence, remedy };
+        return AlarmTexts { event: Cow::Borrowed(&alarm.event), consequence: &alarm.consequence, remedy };
     };
-    let case = case(&alarm.what, alarm.id.head());
-    AlarmTexts { what: Cow::Owned(format!("{head}{case}")), consequence, remedy: remedy.to_vec() }
+    let case = case(&alarm.event, alarm.id.head());
+    AlarmTexts { event: Cow::Owned(format!("{head}{case}")), consequence, remedy: remedy.to_vec() }
 }
 
 /// Returns the specific end of `what`, the cause of an alarm. A cause consists of a general text, a colon and the
@@ -398,21 +398,21 @@ mod tests {
         for &id in AlarmId::ALL {
             let remedy = id.remedy().iter().map(|line| (*line).to_owned()).collect::<Vec<_>>();
             let what = format!("{}: grinder at 12 mm.", id.head());
-            let alarm = Alarm { id, what, consequence: "c".to_owned(), remedy, clears: Role::Operator };
+            let alarm = Alarm { id, event: what, consequence: "c".to_owned(), remedy, cleared_by: Role::Operator };
             for language in [Language::De, Language::Zh] {
                 let said = alarm_texts(&alarm, language);
-                assert!(said.what.ends_with(": grinder at 12 mm."), "{id:?}: {}", said.what);
-                assert!(!said.what.starts_with(id.head()), "{id:?} is not translated");
+                assert!(said.event.ends_with(": grinder at 12 mm."), "{id:?}: {}", said.event);
+                assert!(!said.event.starts_with(id.head()), "{id:?} is not translated");
                 assert_eq!(said.remedy.len(), alarm.remedy.len(), "{id:?} in {language:?}");
             }
-            assert_eq!(alarm_texts(&alarm, Language::En).what, alarm.what);
+            assert_eq!(alarm_texts(&alarm, Language::En).event, alarm.event);
             let older = id.head().replace(|letter: char| letter.is_alphabetic(), "#");
-            let older = Alarm { what: format!("{older}: grinder at 12 mm."), ..alarm };
+            let older = Alarm { event: format!("{older}: grinder at 12 mm."), ..alarm };
             assert!(
-                alarm_texts(&older, Language::De).what.ends_with(": grinder at 12 mm."),
+                alarm_texts(&older, Language::De).event.ends_with(": grinder at 12 mm."),
                 "{id:?}: its older wording"
             );
-            assert!(!alarm_texts(&older, Language::De).what.contains('#'), "{id:?}: its older wording");
+            assert!(!alarm_texts(&older, Language::De).event.contains('#'), "{id:?}: its older wording");
         }
     }
 }

@@ -91,7 +91,7 @@ async fn follow(folder: &Path, history: &Arc<History>, seen: &Sender<ObservedRun
     let mut read_at = None;
     while let Some(snapshot) = watch.next().await? {
         // Measurements, judgements and alarms always come with a new state.
-        let at = (snapshot.number, snapshot.cycles.len());
+        let at = (snapshot.state_number, snapshot.cycles.len());
         let summary = match read_at {
             Some(before) if before == at => Arc::clone(&seen.borrow().summary),
             _ => read(folder, history).await,

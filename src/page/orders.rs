@@ -85,7 +85,7 @@ fn name_of(request: &Request) -> Option<&'static str> {
         Request::Stop { .. } => Some("stop"),
         Request::Abort { .. } => Some("abort"),
         // Only a resume for the state that the person saw is accepted.
-        Request::Resume { seen: Some(_), .. } => Some("resume"),
+        Request::Resume { state_number: Some(_), .. } => Some("resume"),
         Request::Loaded => Some("loaded"),
         Request::Clear { .. } => Some("clear"),
         Request::Over { .. } => Some("over"),
@@ -106,10 +106,10 @@ fn not_for(session: &Session, order: &str) -> Option<String> {
 async fn clears_alarm_of_another(folder: &std::path::Path, session: &Session) -> Option<String> {
     let person = session.person.as_ref().filter(|person| person.role != PageRole::Engineer)?;
     let Reply { status, .. } = give(folder.to_owned(), Request::Status, session).await.ok()?;
-    let theirs = status.alarms.iter().find(|alarm| alarm.clears == Role::ProcessEngineer)?;
+    let theirs = status.alarms.iter().find(|alarm| alarm.cleared_by == Role::ProcessEngineer)?;
     Some(format!(
         "the order resume from {person}, which is not allowed, because only an engineer can clear the active alarm \"{}\"",
-        theirs.what
+        theirs.event
     ))
 }
 
@@ -138,7 +138,7 @@ pub(crate) async fn take_control(
 
 fn answered(reply: std::io::Result<Reply>) -> Response {
     match reply {
-        Ok(Reply { taken, message, .. }) => Json(Answer { accepted: taken, message }).into_response(),
+        Ok(Reply { accepted: taken, message, .. }) => Json(Answer { accepted: taken, message }).into_response(),
         Err(error) => {
             let message =
                 format!("the program that runs the cell does not answer: {error}; check that this program still runs");

@@ -96,7 +96,7 @@ pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) ->
         "last": seen.summary.last,
         "machinesWithin": seen.summary.machines_within,
         "over": seen.summary.ended.is_some() && !seen.answers,
-        "number": live.map(|live| live.number),
+        "number": live.map(|live| live.state_number),
         "can": live.map_or_else(Vec::new, |live| can(live, session, has_control)),
         "cycle": live.map(|live| live.cycle),
         "cycles": cycles,
@@ -256,7 +256,9 @@ fn next(seen: &ObservedRun, language: Language) -> Markup {
 /// Returns the HTML of the progress of the current job (work of one machine, such as grinding or measuring). The HTML
 /// is empty if no job runs.
 fn job(live: &Snapshot, language: Language) -> Markup {
-    let Some(JobProgress { device, done, total, left_s }) = live.progress else { return Markup::default() };
+    let Some(JobProgress { device, done, total, remaining_s: left_s }) = live.progress else {
+        return Markup::default();
+    };
     let percent = 100.0 * f64::from(done.min(total)) / f64::from(total.max(1));
     let unit = if device == Device::Cmm { format!(" {done}/{total}") } else { String::new() };
     html! {
@@ -266,7 +268,7 @@ fn job(live: &Snapshot, language: Language) -> Markup {
             @if let Some(left) = left_s { span .left { (range(left)) " " (Text::TimeLeft.to(language)) } }
         }
         progress max=(total.max(1)) value=(done) aria-label=(device) {}
-        @if let Some(PreviewStatistics { touched, rms_um, least_um, most_um }) = live.so_far {
+        @if let Some(PreviewStatistics { touch_count, rms_um, min_um, max_um }) = live.preview {
             p .quiet title=(Text::PreliminaryMeans.to(language)) {
                 (Text::PreliminaryPoints.to(language)) ": " (touched) " " (Text::Touched.to(language))
                 (format!(", RMS {rms_um:.2} µm, min {least_um:+.2} µm, max {most_um:+.2} µm"))
@@ -308,7 +310,7 @@ fn alarms(seen: &ObservedRun, language: Language) -> Markup {
                 (standing(alarm, language))
             } @else {
                 article .alarm .past {
-                    h3 { (alarm_texts(alarm, language).what) }
+                    h3 { (alarm_texts(alarm, language).event) }
                     p .quiet {
                         (say(Text::Raised)) " " (when(raised)) ", "
                         @match withdrawn {
@@ -327,11 +329,11 @@ fn standing(alarm: &Alarm, language: Language) -> Markup {
     let (say, said) = (|text: Text| text.to(language), alarm_texts(alarm, language));
     html! {
         article .alarm {
-            h3 { (said.what) }
+            h3 { (said.event) }
             p { (said.consequence) }
             p .quiet { (say(Text::WhatToDo)) ":" }
             ol { @for remedy in &said.remedy { li { (remedy) } } }
-            p .quiet { (say(Text::ClearedBy)) ": " (say(match alarm.clears {
+            p .quiet { (say(Text::ClearedBy)) ": " (say(match alarm.cleared_by {
                 Role::Nobody => Text::ByItself,
                 Role::Operator => Text::ByOperator,
                 _ => Text::ByEngineer,

@@ -28,7 +28,7 @@ pub struct Knowledge {
     /// if this cell is one of the two.
     pub pairs: Vec<([Learned; 2], bool)>,
     /// Reason for each result that was rejected.
-    pub left_alone: Vec<String>,
+    pub skipped: Vec<String>,
 }
 
 /// Result as the plant delivered it.
@@ -102,7 +102,7 @@ impl Knowledge {
                     let values: [&(dyn ToSql + Sync); 3] = [&run, &"a lesson refused", &words];
                     let told = link.client().query_one("SELECT complain($1, $2, $3)", &values).await;
                     told.map_err(refused("the report of a problem"))?;
-                    self.left_alone.push(words);
+                    self.skipped.push(words);
                 }
             }
         }

@@ -40,7 +40,7 @@ pub struct Replicator {
     /// Runs that are completely replicated, with the stamp of their files at that time.
     settled: HashMap<String, Stamp>,
     /// Runs that cannot be replicated, with the reason.
-    left_alone: HashMap<String, String>,
+    skipped: HashMap<String, String>,
     /// Files, by run and name, that cannot be replicated and were reported.
     reported: HashSet<(String, String)>,
 }
@@ -71,12 +71,12 @@ impl Replicator {
     /// folder for files that are too large for the plant's database; it is `None` if there is no such folder. Sends
     /// nothing yet.
     pub fn new(runs: PathBuf, artefacts: Option<ArtefactSettings>) -> Self {
-        Self { runs, artefacts, settled: HashMap::new(), left_alone: HashMap::new(), reported: HashSet::new() }
+        Self { runs, artefacts, settled: HashMap::new(), skipped: HashMap::new(), reported: HashSet::new() }
     }
 
     /// Returns the runs that are no longer replicated because they differ from the plant's copy, each with the reason.
     pub fn skipped(&self) -> impl Iterator<Item = (&str, &str)> {
-        self.left_alone.iter().map(|(run, why)| (run.as_str(), why.as_str()))
+        self.skipped.iter().map(|(run, why)| (run.as_str(), why.as_str()))
     }
 
     /// Sends the records and files that the plant does not have yet, the run with the newest change first. Returns the
@@ -93,7 +93,7 @@ impl Replicator {
                 Ok(true) => drop(self.settled.insert(name, stamp)),
                 Ok(false) => {}
                 Err(PlantError::Differs { run, what }) => {
-                    self.left_alone.insert(run.clone(), what.clone());
+                    self.skipped.insert(run.clone(), what.clone());
                     shipped.differ.push((run, what));
                 }
                 // The journal is being created, or cannot be read now: a later round retries.
@@ -113,7 +113,7 @@ impl Replicator {
         let mut open: Vec<(String, Stamp)> = named
             .filter(|name| !name.starts_with('.') && self.runs.join(name).join(DATABASE).is_file())
             .map(|name| (stamp(&self.runs.join(&name)), name))
-            .filter(|(at, name)| self.settled.get(name) != Some(at) && !self.left_alone.contains_key(name))
+            .filter(|(at, name)| self.settled.get(name) != Some(at) && !self.skipped.contains_key(name))
             .map(|(stamp, name)| (name, stamp))
             .collect();
         open.sort_by_key(|(_, stamp)| std::cmp::Reverse(stamp.iter().flatten().map(|(at, _)| *at).max()));

@@ -121,6 +121,11 @@ const RENAMED: &[RenamedKey] = &[
     RenamedKey { old: "compensation.largest_correction_um", new: "compensation.max_correction_um" },
     RenamedKey { old: "compensation.largest_displacement_mm", new: "compensation.max_displacement_mm" },
     RenamedKey { old: "cycle.most_cycles", new: "cycle.max_cycles" },
+    RenamedKey { old: "simulation.cmm.travel_least_mm", new: "simulation.cmm.min_travel_mm" },
+    RenamedKey { old: "simulation.cmm.travel_most_mm", new: "simulation.cmm.max_travel_mm" },
+    RenamedKey { old: "simulation.cmm.unexpected_touches_most", new: "simulation.cmm.max_unexpected_touches" },
+    RenamedKey { old: "simulation.grinder.feed_most_mm_min", new: "simulation.grinder.max_feed_mm_min" },
+    RenamedKey { old: "simulation.grinder.map_most_um", new: "simulation.grinder.max_map_um" },
 ];
 
 static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<RecipeFile>);

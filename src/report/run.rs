@@ -214,7 +214,7 @@ fn decision_rule(tolerance: &Tolerance) -> String {
          uncertainty of each figure includes the noise of the probe and the uncertainty of the pose. If no form error is detectable, only an \
          upper bound of a figure is known. U is half of the 95 % credible interval of the figure. PV is the largest deviation minus the \
          smallest deviation along the normal of the surface{}.",
-        match tolerance.pv_of {
+        match tolerance.pv_points {
             regrind_cell::PvPoints::All => ", of the measured points",
             regrind_cell::PvPoints::MostPoints =>
                 "; PV 99.8 % is the PV over the aperture (the measured points and the positions between the points). The lowest 0.1 % and the highest 0.1 % are left out, but never a measured point",
@@ -292,7 +292,15 @@ fn cycles(story: &RunHistory) -> String {
 /// empty text if the record contains no parameters.
 fn parameters(story: &RunHistory) -> String {
     let row = |number: u32, of: &RecordedParameter| {
-        let RecordedParameter { name, unit, off, expanded, taken, told, removes_rms_um } = of;
+        let RecordedParameter {
+            name,
+            unit,
+            estimate: off,
+            expanded_uncertainty: expanded,
+            compensated: taken,
+            total_correction: told,
+            rms_reduction_um: removes_rms_um,
+        } = of;
         format!(
             "<tr><td class=\"n\">{number}</td><td>{}</td><td class=\"n\">{off:.2} \u{b1} {expanded:.2} {unit}</td>\
              <td class=\"n\">{taken:.2} {unit}</td><td class=\"n\">{told:.2} {unit}</td><td class=\"n\">{removes_rms_um:.2}</td></tr>\n",

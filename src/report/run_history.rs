@@ -95,7 +95,7 @@ impl Measurement {
     /// points. The further points become part of the same measurement. Returns false if the measurement has no figures
     /// yet.
     fn expects_more_touches(&self) -> bool {
-        self.figures.as_ref().is_some_and(|figures| figures.touch_on.is_some())
+        self.figures.as_ref().is_some_and(|figures| figures.further_touches.is_some())
     }
 }
 
@@ -177,7 +177,7 @@ impl RunHistory {
                 let standing = |a: &&mut AlarmHistory| a.alarm.id == alarm && a.withdrawn.is_none();
                 self.alarms.iter_mut().filter(standing).for_each(|a| a.withdrawn = Some(record.utc.clone()));
             }
-            Command::Refuse { event, why, .. } => {
+            Command::Refuse { event, reason: why, .. } => {
                 let given = |order: &&mut Order| order.event.as_ref() == Some(&*event) && order.refused.is_none();
                 if let Some(order) = self.orders.iter_mut().rev().find(given) {
                     order.refused = Some(why);
@@ -234,7 +234,7 @@ impl RunHistory {
                 story.expected_mm = Some([summary.predicted_pv_mm, summary.predicted_rms_mm]);
                 (story.parameters, story.map_rms_mm) = (summary.parameters, summary.map_rms_mm);
             }
-            Event::RegistrationFailed { cycle, why } => {
+            Event::RegistrationFailed { cycle, reason: why } => {
                 self.measurement(cycle).unusable = Some(format!("not registered: {why}"));
             }
             event if event.actor().is_some() => {

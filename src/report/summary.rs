@@ -158,7 +158,7 @@ fn cycle_summary(cycle: u32, story: &CycleHistory, tolerance: Option<&Tolerance>
         verdict: judgement.map(verdict_words),
         reason: judgement.map_or_else(unusable, |judgement| judgement.reason.clone()),
         figures,
-        left_out: last.and_then(|of| of.figures.as_ref()?.left_out.as_ref()).map(|of| of.places.clone()),
+        left_out: last.and_then(|of| of.figures.as_ref()?.with_outliers.as_ref()).map(|of| of.description.clone()),
         expected: story.expected_mm.map(|figures| figures.map(|mm| 1e3 * mm)),
         map: story.map.as_ref().map(|(name, _)| name.clone()),
         deviations: story.deviations.clone(),

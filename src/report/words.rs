@@ -189,13 +189,13 @@ pub(super) fn verdict_words(judgement: &Judgement) -> String {
 
 /// Returns in one line the cause of an alarm, its consequence, and what to do.
 pub(super) fn alarm_words(alarm: &Alarm) -> String {
-    format!("{} {} {}", alarm.what, alarm.consequence, alarm.remedy.join(" "))
+    format!("{} {} {}", alarm.event, alarm.consequence, alarm.remedy.join(" "))
 }
 
 /// Returns the role of the people who can clear an alarm, such as "process engineer". Returns "itself" if the alarm
 /// clears without an action of a person.
 pub(super) fn role_words(alarm: &Alarm) -> String {
-    match alarm.clears {
+    match alarm.cleared_by {
         Role::Nobody => "itself".to_owned(),
         role => spaced(&format!("{role:?}")),
     }
@@ -204,9 +204,9 @@ pub(super) fn role_words(alarm: &Alarm) -> String {
 fn command_words(command: &Command) -> String {
     match command {
         Command::Announce(judgement) => judgement_words(judgement),
-        Command::Raise(alarm) => format!("ALARM {} {}", alarm.what, alarm.consequence),
+        Command::Raise(alarm) => format!("ALARM {} {}", alarm.event, alarm.consequence),
         Command::Withdraw { alarm } => format!("alarm withdrawn: {}", spaced(&format!("{alarm:?}"))),
-        Command::Refuse { event, state, why } => format!("{} refused in {state}: {why}", spaced(event.name())),
+        Command::Refuse { event, state, reason: why } => format!("{} refused in {state}: {why}", spaced(event.name())),
         Command::Finish(ending) => format!("finish, {}", ending_words(ending)),
         command => {
             let name = command.name();
@@ -226,17 +226,17 @@ fn event_words(event: &Event) -> String {
         | Event::Stop { reason, .. }
         | Event::Abort { reason, .. } => reason.clone(),
         Event::DeclaredOver { evidence, .. } => evidence.clone(),
-        Event::Connected { simulated, found, .. } => found_words(*simulated, found),
-        Event::NotConnected { why, .. } => mismatch_words(why),
-        Event::LinkLost { why, .. } | Event::StartUnknown { why, .. } | Event::RegistrationFailed { why, .. } => {
-            why.clone()
-        }
+        Event::Connected { simulated, occupation: found, .. } => found_words(*simulated, found),
+        Event::NotConnected { reason: why, .. } => mismatch_words(why),
+        Event::LinkLost { reason: why, .. }
+        | Event::StartUnknown { reason: why, .. }
+        | Event::RegistrationFailed { reason: why, .. } => why.clone(),
         Event::ConditionLost { condition, message, .. } => format!("{condition}: {message}"),
         Event::ConditionBack { condition, .. } => condition.to_string(),
         Event::Progressed { done, total, .. } => format!("{done} of {total}"),
         Event::Ended { result, .. } => result.to_string(),
         Event::Obstructed { message, .. } => message.clone(),
-        Event::Refused { what, why, .. } => format!("{}: {why}", spaced(&format!("{what:?}"))),
+        Event::Refused { request: what, reason: why, .. } => format!("{}: {why}", spaced(&format!("{what:?}"))),
         Event::Fault { code, message, .. } => format!("{code}, {message}"),
         Event::Reconciled { outcome, .. } => reconciliation_words(outcome),
         Event::Collected { targets, found, gate, .. } => format!("{found} of {targets} points, {}", gate_words(gate)),
@@ -246,7 +246,7 @@ fn event_words(event: &Event) -> String {
         Event::Registered { figures, .. } => figures_words(figures),
         Event::Compensated { summary, .. } => format!(
             "largest correction {:.2} µm, largest removal {:.2} µm, share of the part that the wheel does not touch: {}, expected PV after the pass {:.2} µm{}",
-            1e3 * summary.largest_mm,
+            1e3 * summary.max_correction_mm,
             1e3 * summary.depth_mm,
             in_air(summary.air_share),
             1e3 * summary.predicted_pv_mm,
@@ -256,11 +256,13 @@ fn event_words(event: &Event) -> String {
                 .map(|said| format!("; {said}"))
                 .collect::<String>()
         ),
-        Event::CompensationRefused { why, .. } => match why {
+        Event::CompensationRefused { reason: why, .. } => match why {
             CompensationRefusal::BudgetSpent(words) | CompensationRefusal::Failed(words) => words.clone(),
             CompensationRefusal::WeakDirections(directions) => format!("weak directions: {}", directions.join(", ")),
         },
-        Event::RecordFailed { why: RecordFailure::DiskFull(words) | RecordFailure::Unwritable(words) } => words.clone(),
+        Event::RecordFailed { reason: RecordFailure::DiskFull(words) | RecordFailure::Unwritable(words) } => {
+            words.clone()
+        }
         _ => String::new(),
     };
     if more.is_empty() { name } else { format!("{name}, {more}") }
@@ -332,7 +334,7 @@ fn figures_words(figures: &Figures) -> String {
         let um = |of: &RecordedInterval| {
             format!("{:.2} ({:.2} to {:.2}) µm", 1e3 * of.median_mm, 1e3 * of.low_mm, 1e3 * of.high_mm)
         };
-        let (pv, rms, scatter_um) = (um(&form.pv_robust), um(&form.rms), 1e3 * form.scatter_mm);
+        let (pv, rms, scatter_um) = (um(&form.pv_998), um(&form.rms), 1e3 * form.noise_sigma_mm);
         let _ = write!(line, "; form without the probe noise of {scatter_um:.2} µm: PV 99.8 % {pv}, RMS {rms}");
     }
     for words in figures.weak_directions.iter().chain(&figures.warnings) {

@@ -26,7 +26,7 @@ pub fn follow(running: &mut Running, folder: &dyn Fn() -> Option<PathBuf>, lines
         if let Some(status) = folder().and_then(|folder| send_request(&folder, &Request::Status).ok())
             && status.status.state == StateName::Held
         {
-            let resume = Request::Resume { reason: "seen".into(), seen: Some(status.status.number) };
+            let resume = Request::Resume { reason: "seen".into(), state_number: Some(status.status.state_number) };
             // The program may have been killed meanwhile, or may still wait for a machine.
             let _ = send_request(&folder().unwrap(), &resume);
         }

@@ -80,7 +80,7 @@ pub async fn attempt_with(
         hold_and_resume(rig, &folder, &mut tried).await;
     }
     let (reply, began, took) = order(&folder, Request::Abort { reason: "a try".into() }).await;
-    assert!(reply.taken, "{}: {reply:?}", moment.name);
+    assert!(reply.accepted, "{}: {reply:?}", moment.name);
     tried.abort_answered = took;
     if !hold {
         tried.state = reply.message;
@@ -99,14 +99,15 @@ pub async fn attempt_with(
 
 async fn hold_and_resume(rig: &Rig, folder: &std::path::Path, tried: &mut Tried) {
     let (reply, began, took) = order(folder, Request::Hold { reason: "a try".into() }).await;
-    assert!(reply.taken, "{reply:?}");
+    assert!(reply.accepted, "{reply:?}");
     tried.hold_answered = Some(took);
     until(folder, |words| words.starts_with("Held")).await;
     tried.hold = [CMM, GRINDER].iter().find_map(|m| rig.command_at(*m, 4, began)).map(|at| at - began);
     tried.state = words(folder).await;
     let began = Instant::now();
-    let (reply, began_order, took) = order(folder, Request::Resume { reason: "a try".into(), seen: None }).await;
-    assert!(reply.taken, "{reply:?}, {began:?}");
+    let (reply, began_order, took) =
+        order(folder, Request::Resume { reason: "a try".into(), state_number: None }).await;
+    assert!(reply.accepted, "{reply:?}, {began:?}");
     tried.resume_answered = Some(took);
     if reply.message.starts_with("Unholding") {
         until(folder, |words| !words.starts_with("Unholding")).await;

@@ -66,7 +66,7 @@ pub fn correction(half_mm: [f64; 2]) -> Correction {
     let corners = [[-reach[0], -reach[1]], reach];
     let grid = Grid::over(corners.into_iter(), 0.5).unwrap();
     let values_mm = (0..grid.len()).map(|k| grid.place_mm(k)).map(|[x, y]| error_mm(x, y)).collect();
-    Correction { grid, values_mm, cycle: 2, level_mm: 0.02, set: None }
+    Correction { grid, values_mm, cycle: 2, level_mm: 0.02, parameters: None }
 }
 
 /// Returns a point of the target surface in closed form: the shape moved along its normals by level and correction.

@@ -40,17 +40,17 @@ fn figures() -> Figures {
         coverage: 0.99,
         points: 812,
         outliers: 3,
-        left_out: None,
+        with_outliers: None,
         shift_mm: 0.1,
-        turn_rad: 0.01,
+        rotation_rad: 0.01,
         weak_directions: Vec::new(),
         warnings: vec!["the part is warm".into()],
         forecast: None,
-        pv_robust_mm: None,
+        pv_998_mm: None,
         response: None,
         removed_mm: Some(0.1),
         unstated: None,
-        touch_on: None,
+        further_touches: None,
     }
 }
 
@@ -58,7 +58,7 @@ fn events() -> Vec<Event> {
     let device = Device::Grinder;
     vec![
         Event::Start { actor: Actor { name: "Ada".into(), station: "console".into() } },
-        Event::Connected { device, boot_id: 1, simulated: true, found: Occupation::Idle },
+        Event::Connected { device, boot_id: 1, simulated: true, occupation: Occupation::Idle },
         Event::Fault { device, code: 5, message: "drive\u{1b}[2J too warm".into() },
         Event::Registered { cycle: 1, figures: figures() },
     ]
@@ -67,10 +67,10 @@ fn events() -> Vec<Event> {
 fn orders() -> Vec<Order> {
     let alarm = Alarm {
         id: AlarmId::MachineFault,
-        what: "A machine is in fault: grinder.".into(),
+        event: "A machine is in fault: grinder.".into(),
         consequence: "The run is aborted.".into(),
         remedy: vec!["Look at it.".into()],
-        clears: Role::Operator,
+        cleared_by: Role::Operator,
     };
     vec![
         Order::StartMachine { device: Device::Grinder, cycle: 1 },

@@ -64,7 +64,7 @@ async fn careful_start_after_refused_measurement() {
     let (drive, _orders) = Drive::new(ready.run, cmm, ready.grinder).unwrap();
     let running = tokio::spawn(drive.run());
     until(&folder, |words| words.starts_with("Held (Measure, Send)")).await;
-    order(&folder, Request::Resume { reason: "seated anew".into(), seen: None }).await;
+    order(&folder, Request::Resume { reason: "seated anew".into(), state_number: None }).await;
     event(&mut notices, "compensated", 1).await;
     let began = Instant::now();
     while plans.lock().unwrap().len() < 3 {
@@ -106,7 +106,7 @@ async fn result_of_other_probe_radius_refused() {
     };
     let alarm = tokio::time::timeout(PATIENCE, told).await.expect("an alarm");
     assert_eq!(alarm.id, AlarmId::BrokenResult, "{alarm:?}");
-    assert!(alarm.what.contains("mm, but the recipe has"), "{}", alarm.what);
+    assert!(alarm.event.contains("mm, but the recipe has"), "{}", alarm.event);
     until(&folder, |words| words.starts_with("Held (Measure, Send)")).await;
     order(&folder, Request::Abort { reason: "seen enough".into() }).await;
     running.await.unwrap();

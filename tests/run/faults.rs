@@ -29,9 +29,9 @@ fn caught(what: &str, setup: Setup, alarm: AlarmId, words: &[&str], passes: usiz
     assert!(!ran.accepted(), "{told}");
     let alarms = ran.alarms();
     let first = alarms.first().unwrap_or_else(|| panic!("no alarm was raised\n{told}"));
-    println!("{}\n{}\n{:#?}", first.what, first.consequence, first.remedy);
+    println!("{}\n{}\n{:#?}", first.event, first.consequence, first.remedy);
     assert_eq!(first.id, alarm, "{told}");
-    let said = format!("{} {} {}", first.what, first.consequence, first.remedy.join(" "));
+    let said = format!("{} {} {}", first.event, first.consequence, first.remedy.join(" "));
     for word in words {
         assert!(said.contains(word), "{what}: `{word}` is missing in: {said}");
     }

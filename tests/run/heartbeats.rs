@@ -99,10 +99,10 @@ async fn heartbeats_continue_during_computation() {
         assert!(came >= 2, "{came} beats came to machine {machine} while the points were registered");
     }
     until(&folder, |words| words.starts_with("Held")).await;
-    order(&folder, Request::Resume { reason: String::new(), seen: None }).await;
+    order(&folder, Request::Resume { reason: String::new(), state_number: None }).await;
     // The judgement is immediate. Now the map is computed from 451,401 deviations.
     let (reply, asked, _) = order(&folder, Request::Abort { reason: "while it computes".into() }).await;
-    assert!(reply.taken, "{reply:?}");
+    assert!(reply.accepted, "{reply:?}");
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
     for machine in [CMM, GRINDER] {

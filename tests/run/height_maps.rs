@@ -248,7 +248,7 @@ async fn run(seed: u64) -> Ran {
                 Notice::Finished { cycles: rows, .. } => cycles = rows,
                 Notice::Progress { .. } | Notice::State { .. } => {}
                 // A held cell waits for a person, and this test has no person.
-                Notice::Alarm(alarm) if alarm.clears != Role::Nobody => panic!("{}: {said:#?}", alarm.what),
+                Notice::Alarm(alarm) if alarm.cleared_by != Role::Nobody => panic!("{}: {said:#?}", alarm.event),
                 other => said.push(format!("{other:?}")),
             }
         }

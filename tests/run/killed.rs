@@ -93,7 +93,7 @@ fn hold_against(rig: &Rig, folder: &Path, seed: u64) {
         let mut began: BTreeMap<u16, u32> = BTreeMap::new();
         rig.servings[machine].machines()[0].1.with(|m| {
             for seen in m.log() {
-                if let HandshakeEvent::Began { job: of, cycle, .. } = seen.what
+                if let HandshakeEvent::Began { job: of, cycle, .. } = seen.event
                     && of == job
                 {
                     *began.entry(cycle).or_default() += 1;

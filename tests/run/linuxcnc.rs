@@ -121,7 +121,7 @@ fn to_its_end(mut running: Running, home: &Path) -> String {
             && let Ok(status) = send_request(&folder, &Request::Status)
             && status.status.state == StateName::Held
         {
-            let resume = Request::Resume { reason: "seen".into(), seen: Some(status.status.number) };
+            let resume = Request::Resume { reason: "seen".into(), state_number: Some(status.status.state_number) };
             // The run may have continued meanwhile.
             let _ = send_request(&folder, &resume);
         }

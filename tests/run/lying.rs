@@ -101,7 +101,7 @@ async fn alarm(notices: &mut UnboundedReceiver<Notice>) -> (AlarmId, String) {
     let told = async {
         loop {
             match notices.recv().await.expect("the run goes on") {
-                Notice::Alarm(alarm) => return (alarm.id, alarm.what),
+                Notice::Alarm(alarm) => return (alarm.id, alarm.event),
                 Notice::Finished { ending, .. } => panic!("over: {ending:?}"),
                 _ => {}
             }
@@ -111,8 +111,8 @@ async fn alarm(notices: &mut UnboundedReceiver<Notice>) -> (AlarmId, String) {
 }
 
 async fn resume(folder: &std::path::Path) {
-    let (reply, ..) = order(folder, Request::Resume { reason: "seen to".into(), seen: None }).await;
-    assert!(reply.taken, "{reply:?}");
+    let (reply, ..) = order(folder, Request::Resume { reason: "seen to".into(), state_number: None }).await;
+    assert!(reply.accepted, "{reply:?}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -173,7 +173,7 @@ async fn discarded_result_is_measured_again() {
     assert_eq!(id, AlarmId::MachineRefused, "{what}");
     until(&folder, |words| words.starts_with("Held (Measure, Collect)")).await;
     let over = Request::Over { device: Device::Cmm, evidence: "its panel shows no result".into() };
-    assert!(order(&folder, over).await.0.taken);
+    assert!(order(&folder, over).await.0.accepted);
     until(&folder, |words| words.starts_with("Held (Measure, Send)")).await;
     resume(&folder).await;
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
@@ -211,7 +211,7 @@ async fn stop_not_executed_aborts() {
     let (drive, _orders) = Drive::new(run, cmm, ScriptedGrinder::saying(grinder, says)).unwrap();
     let running = tokio::spawn(drive.run());
     event(&mut notices, "started", 1).await;
-    assert!(order(&folder, Request::Stop { reason: "enough".into() }).await.0.taken);
+    assert!(order(&folder, Request::Stop { reason: "enough".into() }).await.0.accepted);
     let (id, what) = alarm(&mut notices).await;
     assert_eq!(id, AlarmId::StopNotConfirmed, "{what}");
     assert!(what.contains("STOP") && what.contains("EXECUTE"), "{what}");

@@ -81,7 +81,7 @@ impl Bench {
     /// Returns the limits in mm: with the PV of all points and the PV of most points.
     fn limits_mm(&self) -> [f64; 3] {
         let tolerance = &self.plan.tolerance;
-        match tolerance.pv_of {
+        match tolerance.pv_points {
             PvPoints::All => [tolerance.pv_mm, f64::INFINITY, tolerance.rms_mm],
             PvPoints::MostPoints => [f64::INFINITY, tolerance.pv_mm, tolerance.rms_mm],
         }

@@ -119,7 +119,7 @@ fn tracker_files_give_no_map_unlocked() {
         let cloud: Vec<Point> = found.points.iter().map(|p| Point::from(p.position_mm)).collect();
         let free = registered(&nominal, &cloud, [false; 6]);
         let v = &free.quality;
-        let said: Vec<&str> = v.weak_directions.iter().map(|w| w.words.as_str()).collect();
+        let said: Vec<&str> = v.weak_directions.iter().map(|w| w.description.as_str()).collect();
         println!(
             "{} of {points} used, rms {:.2} um, PV {:.1} um; {}",
             v.inliers,

@@ -48,7 +48,7 @@ fn frames(rig: &Rig, machine: usize, from: usize) -> Vec<CommandFrame> {
     rig.servings[machine].machines()[0].1.with(|m| {
         let seen = m.log()[from..].iter();
         seen.filter_map(
-            |seen| if let HandshakeEvent::Commanded { frame, .. } = &seen.what { Some(*frame) } else { None },
+            |seen| if let HandshakeEvent::Commanded { frame, .. } = &seen.event { Some(*frame) } else { None },
         )
         .collect()
     })
@@ -182,7 +182,7 @@ async fn abort_while_journal_is_locked() {
     // A person who had to wait too long learns that the order is not on record. No person learns that it is on record
     // before it is.
     let reply = ordered.await.unwrap();
-    assert!(if reply.taken { on_record(&folder) } else { reply.message.contains("not recorded") }, "{reply:?}");
+    assert!(if reply.accepted { on_record(&folder) } else { reply.message.contains("not recorded") }, "{reply:?}");
     let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
     assert!(on_record(&folder) && verify(&folder).unwrap().closed);
@@ -263,7 +263,7 @@ async fn unsaved_result_is_recomputed() {
     let (drive, orders): (_, OrderSender) = Drive::new(run, cmm, grinder).unwrap();
     let running = tokio::spawn(drive.run());
     event(&mut notices, "not_saved", 1).await;
-    orders.send(Request::Resume { reason: "the disk is well again".into(), seen: None }, actor).await;
+    orders.send(Request::Resume { reason: "the disk is well again".into(), state_number: None }, actor).await;
     let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }), "{ending:?}");
     assert!(folder.join("cycle-1/attempt-2/deviations.csv").is_file());

@@ -61,7 +61,7 @@ async fn panicking_driver_raises_alarm() {
     assert_eq!(alarm.id, AlarmId::ProgramFailed, "{alarm:?}");
     // The message of the panic is named too.
     for piece in ["grinder", "out of bounds"] {
-        assert!(alarm.what.contains(piece), "{piece}: {}", alarm.what);
+        assert!(alarm.event.contains(piece), "{piece}: {}", alarm.event);
     }
     until(&folder, |words| words.starts_with("Held")).await;
     let (reply, ..) = order(&folder, Request::Status).await;
@@ -74,7 +74,7 @@ async fn panicking_driver_raises_alarm() {
     };
     tokio::time::timeout(PATIENCE, held).await.expect("the machine holds itself");
     let (reply, asked, _) = order(&folder, Request::Abort { reason: "no way on".into() }).await;
-    assert!(reply.taken, "{reply:?}");
+    assert!(reply.accepted, "{reply:?}");
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: false, .. }), "{ending:?}");
     assert!(rig.command_at(CMM, 7, asked).is_some(), "the other machine hears the abort");

@@ -22,7 +22,7 @@ async fn finished() -> (Rig, PathBuf) {
     event(&mut notices, "registered", 1).await;
     orders.send(Request::Hold { reason: "tea".into() }, actor.clone()).await;
     until(&folder, |words| words.starts_with("Held")).await;
-    orders.send(Request::Resume { reason: "tea is over".into(), seen: None }, actor).await;
+    orders.send(Request::Resume { reason: "tea is over".into(), state_number: None }, actor).await;
     tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(verify(&folder).unwrap().closed);
     (rig, folder)

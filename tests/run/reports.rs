@@ -414,7 +414,7 @@ fn report_of_failed_and_amended_cycles() {
     written.command(judged(Verdict::Continue, "not yet in tolerance"));
     written.command(judged(Verdict::BudgetSpent, "no material is left"));
     written.event(Event::Collected { cycle: 2, targets: 100, found: 100, gate: GateResult::Passed });
-    written.event(Event::RegistrationFailed { cycle: 2, why: "it did not converge".into() });
+    written.event(Event::RegistrationFailed { cycle: 2, reason: "it did not converge".into() });
     let (_home, folder) = written.ended(&Ending::NotAccepted { cycle: 2, reason: "no material is left".into() });
     let page = Page::read(&folder);
     let rows: Vec<String> = page.cycles().iter().map(|row| row.join("|")).collect();
@@ -440,7 +440,7 @@ fn report_shows_no_raw_record() {
     sample_events(1).into_iter().for_each(|event| written.event(event));
     let refused = Event::Resume { actor: ada(), reason: "go".into() };
     let state = State::Execute(Phase::Load);
-    written.command(Command::Refuse { event: Box::new(refused), state, why: "it is not held".into() });
+    written.command(Command::Refuse { event: Box::new(refused), state, reason: "it is not held".into() });
     for command in [raised("link_lost", "Lost."), Command::Withdraw { alarm: AlarmId::LinkLost }] {
         written.command(command);
     }
@@ -506,6 +506,6 @@ pub fn tolerance() -> Tolerance {
         rms_mm: 0.001,
         with_uncertainty: true,
         probability: Tolerance::DEFAULT_PROBABILITY,
-        pv_of: PvPoints::MostPoints,
+        pv_points: PvPoints::MostPoints,
     }
 }

@@ -36,7 +36,7 @@ fn hostile() -> (TempDir, std::path::PathBuf) {
     let mut written = RecordWriter::new(plan);
     written.event(Event::Start { actor: ada() });
     let of = |pv_mm: f64, rms_mm: f64| Figures {
-        pv_robust_mm: Some(pv_mm),
+        pv_998_mm: Some(pv_mm),
         rms_mm,
         form: None,
         pv_expanded_mm: 0.0005,

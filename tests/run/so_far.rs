@@ -34,7 +34,7 @@ async fn status_shows_preliminary_touches() {
     let (drive, orders) = Drive::new(run, driver, grinder).unwrap();
     let running = tokio::spawn(drive.run());
     until(&folder, |words| words.starts_with("Execute (Measure, Run)")).await;
-    assert_eq!(orders.status().borrow().so_far, None);
+    assert_eq!(orders.status().borrow().preview, None);
     let half = |machine: &mut SimulatedMachine| {
         let progress = |machine: &mut SimulatedMachine| machine.read(84, 4).unwrap()[1];
         machine.set_speed(100.0);
@@ -46,20 +46,20 @@ async fn status_shows_preliminary_touches() {
     };
     cmm(&rig, half);
     // Eight full pages of seven points, including those on the reference sphere. The first pages are enough.
-    let told = seen(&folder, |status| status.so_far.filter(|told| told.touched >= 14)).await;
-    let PreviewStatistics { touched, rms_um, least_um, most_um } = told;
+    let told = seen(&folder, |status| status.preview.filter(|told| told.touch_count >= 14)).await;
+    let PreviewStatistics { touch_count, rms_um, min_um, max_um } = told;
     assert!(touched <= 90 && rms_um > 0.0 && rms_um <= least_um.abs().max(most_um.abs()), "{told:?}");
     // After a hold, the points stay visible. Orders are obeyed as usual.
     let (reply, ..) = order(&folder, Request::Hold { reason: "to look".into() }).await;
-    assert!(reply.taken, "{reply:?}");
+    assert!(reply.accepted, "{reply:?}");
     until(&folder, |words| words.starts_with("Held (Measure, Run)")).await;
-    assert!(seen(&folder, |status| status.so_far).await.touched >= touched);
-    let (reply, ..) = order(&folder, Request::Resume { reason: String::new(), seen: None }).await;
-    assert!(reply.taken, "{reply:?}");
+    assert!(seen(&folder, |status| status.preview).await.touch_count >= touched);
+    let (reply, ..) = order(&folder, Request::Resume { reason: String::new(), state_number: None }).await;
+    assert!(reply.accepted, "{reply:?}");
     cmm(&rig, |machine| machine.set_speed(5000.0));
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Accepted { .. }), "{ending:?}");
-    assert_eq!(orders.status().borrow().so_far, None);
+    assert_eq!(orders.status().borrow().preview, None);
     // The record contains none of it.
     let journal = std::fs::read(folder.join("journal.sqlite")).unwrap();
     for word in ["so_far", "preliminary"] {

@@ -166,7 +166,7 @@ impl<'a> Line<'a> {
         let map = self.payload();
         let flat = Map { values_mm: vec![0.0; map.values_mm.len()], ..map.clone() };
         let [real, twin] = &mut self.grinders;
-        let set = self.correction.set.as_ref();
+        let set = self.correction.parameters.as_ref();
         let wheel_radius_mm = self.bench.task.wheel_radius_mm(set);
         let told = Pass { wheel_radius_mm, ..pass_of(&self.bench.task, level_mm) };
         grind(real, self.job, cycle, &map, &told);
@@ -273,7 +273,7 @@ impl<'a> Line<'a> {
         });
         let answer = answer.filter(|_| self.way != Way::Plain);
         let (contacts, set) = self.estimate_parameters(found);
-        let options = task.parameter_options(self.correction.set.as_ref());
+        let options = task.parameter_options(self.correction.parameters.as_ref());
         let grid = self.correction.grid;
         let smoother = task.parameter_compensation.as_ref().map(|taken| {
             move |values: &[f64]| explained_by_parameters(values, &grid, [&contacts, &taken.node_points], &options)
@@ -306,7 +306,7 @@ impl<'a> Line<'a> {
         let used = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         let contact = |d: &Deviation| SurfacePoint { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
         let contacts: Vec<SurfacePoint> = used.map(contact).collect();
-        let before = self.correction.set.clone();
+        let before = self.correction.parameters.clone();
         let Some(taken) = task.parameter_compensation.as_ref().filter(|_| self.before.is_none()) else {
             return (contacts, before);
         };

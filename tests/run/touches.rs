@@ -137,8 +137,10 @@ fn adaptive_batches_publish_figures() {
     // Ten touches with six fitted motions are too few for a statement about the form.
     let forms: Vec<_> = figures.iter().map(|figures| (figures.points, figures.form.map(|form| form.rms))).collect();
     assert!(forms.iter().all(|(points, form)| form.is_some() == (*points > 10)), "{forms:?}");
-    let on: Vec<_> =
-        figures.iter().map(|figures| (figures.points, figures.touch_on.clone().map(|on| on.targets))).collect();
+    let on: Vec<_> = figures
+        .iter()
+        .map(|figures| (figures.points, figures.further_touches.clone().map(|on| on.target_count)))
+        .collect();
     println!("{on:?}");
     assert_eq!(on[0].1, Some(30), "{on:?}");
     assert!(on.last().unwrap().1.is_none(), "{on:?}");

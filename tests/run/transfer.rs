@@ -59,8 +59,9 @@ impl Pair<'_> {
         alike.compare([&of_common[0], &of_common[1]], true);
         let found = self.taught.ground(&first, a, None, parts, passes).1;
         let begun = self.taught.begun_with(found.expect("passes"), &alike);
-        let told = begun.taught_by.as_ref().expect("others' word");
-        let (bands, largest) = (told.differ.len(), told.differ.iter().map(|of| of[1]).fold(0.0, f64::max));
+        let told = begun.origin.as_ref().expect("others' word");
+        let (bands, largest) =
+            (told.machine_difference.len(), told.machine_difference.iter().map(|of| of[1]).fold(0.0, f64::max));
         let with = self.taught.ground(&second, b, Some((begun.correction, begun.known)), 1, passes).0;
         let without = self.taught.ground(&second, b, None, 1, passes).0;
         let apart_um = self.taught.apart_um([(&first, a), (&second, b)]);

@@ -48,9 +48,9 @@ impl Watched {
         let began = Instant::now();
         let mut first = None;
         loop {
-            let (reply, ..) = order(&self.folder, Request::Resume { reason: String::new(), seen: None }).await;
+            let (reply, ..) = order(&self.folder, Request::Resume { reason: String::new(), state_number: None }).await;
             let said = first.get_or_insert(reply.message).clone();
-            if reply.taken {
+            if reply.accepted {
                 return said;
             }
             assert!(began.elapsed() < PATIENCE, "{said}");
@@ -78,13 +78,13 @@ async fn idle_machine_key_holds_moving_one() {
     let alarm = run.alarm().await;
     assert_eq!(alarm.id, AlarmId::NotAutomatic);
     for piece in ["CMM", "manual mode", "while the grinder"] {
-        assert!(alarm.what.contains(piece), "{piece}: {}", alarm.what);
+        assert!(alarm.event.contains(piece), "{piece}: {}", alarm.event);
     }
     until(&run.folder, |words| words.starts_with("Held (Grind, Run)")).await;
     assert!(rig.command_at(GRINDER, HOLD, turned).is_some());
-    let (reply, ..) = order(&run.folder, Request::Resume { reason: String::new(), seen: None }).await;
+    let (reply, ..) = order(&run.folder, Request::Resume { reason: String::new(), state_number: None }).await;
     let refused = ["CMM", "manual mode"].iter().all(|piece| reply.message.contains(piece));
-    assert!(!reply.taken && refused, "{reply:?}");
+    assert!(!reply.accepted && refused, "{reply:?}");
     turn(&rig, CMM, Mode::Automatic);
     run.resume().await;
     until(&run.folder, |words| words.starts_with("Execute (Grind, Run)")).await;
@@ -99,7 +99,7 @@ async fn moving_machine_key_holds_not_aborts() {
     let turned = Instant::now();
     turn(&rig, GRINDER, Mode::Manual);
     let alarm = run.alarm().await;
-    assert!(alarm.id == AlarmId::NotAutomatic && alarm.what.contains("grinder"), "{alarm:?}");
+    assert!(alarm.id == AlarmId::NotAutomatic && alarm.event.contains("grinder"), "{alarm:?}");
     until(&run.folder, |words| words.starts_with("Held (Grind, Run)")).await;
     turn(&rig, GRINDER, Mode::Automatic);
     run.resume().await;
@@ -116,7 +116,7 @@ async fn machine_not_clear_holds_moving_one() {
     rig.servings[CMM].machines()[0].1.with(|machine| machine.open_interlocks(interlock::CLEAR));
     let alarm = run.alarm().await;
     assert_eq!(alarm.id, AlarmId::NotClear);
-    assert!(alarm.what.contains("CMM") && alarm.what.contains("while the grinder moves"), "{}", alarm.what);
+    assert!(alarm.event.contains("CMM") && alarm.event.contains("while the grinder moves"), "{}", alarm.event);
     until(&run.folder, |words| words.starts_with("Held (Grind, Run)")).await;
     assert!(rig.command_at(GRINDER, HOLD, moved).is_some());
     rig.servings[CMM].machines()[0].1.with(|machine| machine.open_interlocks(0));
@@ -133,7 +133,7 @@ async fn manual_mode_prevents_prepare() {
     let running = tokio::spawn(drive.run());
     let mut run = Watched { notices, folder, _orders: orders };
     let alarm = run.alarm().await;
-    assert!(alarm.id == AlarmId::NotAutomatic && alarm.what.contains("CMM"), "{alarm:?}");
+    assert!(alarm.id == AlarmId::NotAutomatic && alarm.event.contains("CMM"), "{alarm:?}");
     until(&run.folder, |words| words.starts_with("Held (Grind, Send)")).await;
     assert!(rig.command_at(GRINDER, 2, began).is_none(), "nothing was prepared");
     assert_eq!(rig.servings[GRINDER].machines()[0].1.with(|machine| machine.state()), State::Idle);

@@ -146,7 +146,7 @@ impl Ran {
 
     /// Returns all the text that a failed test should show.
     pub fn failure_text(&self) -> String {
-        let alarms: Vec<_> = self.alarms().iter().map(|a| format!("{:?}: {}", a.id, a.what)).collect();
+        let alarms: Vec<_> = self.alarms().iter().map(|a| format!("{:?}: {}", a.id, a.event)).collect();
         let rows: Vec<_> = self
             .rows()
             .iter()
@@ -318,8 +318,7 @@ async fn go(setup: Setup) -> Ran {
     let mut seen = Vec::new();
     let mut passes_at_alarm = None;
     while let Some(notice) = shown.recv().await {
-        let person =
-            matches!(&notice, Notice::Alarm(alarm) if alarm.clears != Role::Nobody && alarm.id != AlarmId::Diverging);
+        let person = matches!(&notice, Notice::Alarm(alarm) if alarm.cleared_by != Role::Nobody && alarm.id != AlarmId::Diverging);
         seen.push(notice);
         if person && passes_at_alarm.is_none() {
             passes_at_alarm = Some(world.history().len());

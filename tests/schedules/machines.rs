@@ -133,8 +133,8 @@ impl Machines {
         let by_registers = |number: usize, mut machine: SimulatedMachine| {
             let (log, cues) = (log.clone(), cues.clone());
             machine.set_observer(Box::new(move |seen| {
-                cues.see_machine(&seen.what);
-                log.lock().unwrap().push(Moment { at: Instant::now(), machine: number, what: seen.what.clone() });
+                cues.see_machine(&seen.event);
+                log.lock().unwrap().push(Moment { at: Instant::now(), machine: number, what: seen.event.clone() });
             }));
             Plant::Registers(SharedMachine::from(machine))
         };

@@ -222,7 +222,7 @@ impl Outside {
         let reason = format!("drawn {}", self.number);
         give(&orders, &life, &self.given, (what, reason), &self.plants, |reason| match what {
             "hold" => Request::Hold { reason },
-            "resume" => Request::Resume { reason, seen: None },
+            "resume" => Request::Resume { reason, state_number: None },
             "stop" => Request::Stop { reason },
             _ => Request::Abort { reason },
         })

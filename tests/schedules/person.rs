@@ -63,7 +63,7 @@ impl Person {
             tokio::time::sleep(pause).await;
             let (state, number, phase, next) = {
                 let seen = status.borrow();
-                (seen.state, seen.number, seen.phase, seen.next_step.clone())
+                (seen.state, seen.state_number, seen.phase, seen.next_step.clone())
             };
             if let NextStep::SeeClear { device } = next {
                 self.see_clear(orders, life, device).await;
@@ -81,7 +81,8 @@ impl Person {
                 if let Some(device) = phase.and_then(|phase| phase.moving_device()) {
                     self.look_at(orders, life, device).await;
                 }
-                self.give(orders, life, "resume", |reason| Request::Resume { reason, seen: Some(number) }).await;
+                self.give(orders, life, "resume", |reason| Request::Resume { reason, state_number: Some(number) })
+                    .await;
             }
         }
     }
@@ -130,7 +131,7 @@ pub async fn give(
     let moved = [0, 1].map(|k: usize| plants[k].moves());
     let reply = orders.send_and_wait(request(reason.clone()), actor()).await;
     let Some(reply) = reply.filter(|_| !life.is_dead()) else { return };
-    let accepted = reply.taken;
+    let accepted = reply.accepted;
     let done = accepted || reply.message.contains("make the cell safe");
     given.lock().unwrap().push(GivenOrder { at, answered: Instant::now(), what, reason, accepted, done, moved });
 }

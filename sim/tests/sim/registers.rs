@@ -473,10 +473,10 @@ fn repeated_command_is_idempotent() {
     desk.put(frame);
     assert_eq!(desk.machine.state(), State::Idle, "an old frame is not looked at");
     assert_eq!(desk.machine.began(), [(frame.sequence, 41, 2)]);
-    let repeats = desk.machine.log().iter().filter(|s| matches!(s.what, HandshakeEvent::Repeated { .. })).count();
+    let repeats = desk.machine.log().iter().filter(|s| matches!(s.event, HandshakeEvent::Repeated { .. })).count();
     assert_eq!(repeats, 5);
     assert!(
-        matches!(desk.machine.log().last().unwrap().what, HandshakeEvent::Old { sequence } if sequence == frame.sequence)
+        matches!(desk.machine.log().last().unwrap().event, HandshakeEvent::Old { sequence } if sequence == frame.sequence)
     );
 }
 
@@ -990,7 +990,7 @@ fn handshake_log_of_whole_job() {
         .machine
         .log()
         .iter()
-        .map(|seen| match &seen.what {
+        .map(|seen| match &seen.event {
             HandshakeEvent::Commanded { frame, answer, .. } => format!("{} {answer:?}", frame.command),
             HandshakeEvent::Changed { from, to } => format!("{from:?} {to:?}"),
             HandshakeEvent::Began { start: by, job, cycle } => format!("began {} {job} {cycle}", by - start),
@@ -1011,8 +1011,8 @@ fn handshake_log_of_whole_job() {
         "Execute Complete",
     ];
     assert_eq!(told, expected);
-    assert!(desk.machine.log().is_sorted_by_key(|seen| seen.at));
-    let ended = desk.machine.log().last().unwrap().at;
+    assert!(desk.machine.log().is_sorted_by_key(|seen| seen.time));
+    let ended = desk.machine.log().last().unwrap().time;
     assert!((5.0..5.1).contains(&ended.as_secs_f64()), "{ended:?}");
 }
 
@@ -1026,12 +1026,12 @@ fn ended_event_has_beat_statistics() {
     desk.write_beat(1000, 10);
     desk.wait(3 * S);
     assert_eq!(desk.machine.state(), State::Complete);
-    let ended = desk.machine.log().iter().find_map(|seen| match seen.what {
+    let ended = desk.machine.log().iter().find_map(|seen| match seen.event {
         HandshakeEvent::Ended { beats, .. } => Some(beats),
         _ => None,
     });
     // At 0, 0.25, 0.5 and 0.75 s; then eight from 3.1 to 4.85 s; the job takes 5 s.
-    assert_eq!(ended, Some(BeatStatistics { heard: 12, mean: 4850 * MS / 11, longest_silence: 2350 * MS }));
+    assert_eq!(ended, Some(BeatStatistics { count: 12, mean_interval: 4850 * MS / 11, max_silence: 2350 * MS }));
 }
 
 #[test]
@@ -1094,14 +1094,14 @@ fn check_log(desk: &Desk, seed: u64) {
     let log = desk.machine.log();
     let mut state = State::Idle;
     for (before, seen) in log.iter().zip(&log[1..]) {
-        if let HandshakeEvent::Began { start, .. } = seen.what {
-            let HandshakeEvent::Commanded { frame, answer, state } = &before.what else {
+        if let HandshakeEvent::Began { start, .. } = seen.event {
+            let HandshakeEvent::Commanded { frame, answer, state } = &before.event else {
                 panic!("seed {seed}: {before:?}")
             };
             assert_eq!((frame.sequence, frame.command, *answer), (start, 3, Answer::Accepted), "seed {seed}");
             assert_eq!(*state, State::Prepared, "seed {seed}");
         }
-        if let HandshakeEvent::Changed { from, to } = seen.what {
+        if let HandshakeEvent::Changed { from, to } = seen.event {
             assert_eq!(from, state, "seed {seed}");
             state = to;
             assert!(to != State::Execute || matches!(from, State::Prepared | State::Held), "seed {seed}: {from:?}");

@@ -16,7 +16,7 @@ fn plan() -> CellPlan {
             rms_mm: 0.001,
             with_uncertainty: true,
             probability: Tolerance::DEFAULT_PROBABILITY,
-            pv_of: PvPoints::All,
+            pv_points: PvPoints::All,
         },
         stall_share: 0.02,
         stall_mm: 0.0,
@@ -24,14 +24,14 @@ fn plan() -> CellPlan {
         on_divergence: HoldOrStop::Hold,
         on_refusal: HoldOrStop::Hold,
         gates: GateLimits {
-            least_found: 0.95,
+            min_found_share: 0.95,
             min_coverage: 0.9,
-            most_shift_mm: 1.0,
-            most_turn_rad: 0.1,
-            most_radius_error_mm: Some(0.002),
+            max_shift_mm: 1.0,
+            max_rotation_rad: 0.1,
+            max_radius_error_mm: Some(0.002),
         },
         removal_budget_mm: 0.5,
-        least_depth_mm: 0.002,
+        min_depth_mm: 0.002,
         clear_at_start: false,
         deadlines: Deadlines::default(),
     }
@@ -51,17 +51,17 @@ fn figures(pv_um: f64, rms_um: f64) -> Figures {
         coverage: 0.99,
         points: 1000,
         outliers: 1,
-        left_out: None,
+        with_outliers: None,
         shift_mm: 0.05,
-        turn_rad: 0.001,
+        rotation_rad: 0.001,
         weak_directions: vec![],
         warnings: vec![],
         forecast: None,
-        pv_robust_mm: None,
+        pv_998_mm: None,
         response: None,
         removed_mm: Some(0.1),
         unstated: None,
-        touch_on: None,
+        further_touches: None,
     }
 }
 
@@ -85,7 +85,7 @@ fn abort() -> Event {
 fn good_answer(command: &Command, figures: &mut dyn FnMut(u32) -> Figures) -> Option<Event> {
     Some(match command.clone() {
         Command::Connect { device } | Command::ClearMachine { device } => {
-            Event::Connected { device, boot_id: 7, simulated: true, found: Occupation::Idle }
+            Event::Connected { device, boot_id: 7, simulated: true, occupation: Occupation::Idle }
         }
         Command::AskToLoad => Event::LoadConfirmed { actor: actor() },
         Command::LoadPass { cycle } => Event::PassLoaded { cycle },
@@ -105,8 +105,12 @@ fn good_answer(command: &Command, figures: &mut dyn FnMut(u32) -> Figures) -> Op
         Command::Register { cycle } => Event::Registered { cycle, figures: figures(cycle) },
         Command::Compensate { cycle } => {
             let (largest_mm, depth_mm, predicted_pv_mm) = (0.01, 0.02, 0.005);
-            let summary =
-                CompensationSummary { largest_mm, depth_mm, predicted_pv_mm, ..CompensationSummary::default() };
+            let summary = CompensationSummary {
+                max_correction_mm: largest_mm,
+                depth_mm,
+                predicted_pv_mm,
+                ..CompensationSummary::default()
+            };
             Event::Compensated { cycle, summary }
         }
         Command::Announce(_)
@@ -292,7 +296,7 @@ fn parameter_beyond_holds_until_resume() {
     let mut run = TestRun::new(plan(), |_| figures(30.0, 6.0));
     run.start().run_until(State::Execute(Phase::Compensate));
     let asks = vec!["wheel radius is off by 249.00 um".to_owned()];
-    let summary = CompensationSummary { asks, ..CompensationSummary::default() };
+    let summary = CompensationSummary { confirmations_required: asks, ..CompensationSummary::default() };
     run.send(Event::Compensated { cycle: 1, summary });
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Send)));
     let alarms = run.alarms();
@@ -323,8 +327,8 @@ fn stalled_below_stall_limit() {
 
 #[test]
 fn tolerance_compare_uses_pv_998() {
-    let most = Tolerance { pv_of: PvPoints::MostPoints, ..plan().tolerance };
-    let found = Figures { pv_robust_mm: Some(0.0069), ..figures(8.0, 0.5) };
+    let most = Tolerance { pv_points: PvPoints::MostPoints, ..plan().tolerance };
+    let found = Figures { pv_998_mm: Some(0.0069), ..figures(8.0, 0.5) };
     let [pv, rms] = most.compare(&found);
     assert_eq!(
         (pv.name, pv.median_mm, pv.limit_mm, pv.conformity),
@@ -348,9 +352,9 @@ fn conformity_by_acceptance_probability() {
         let rms = RecordedInterval::from_expanded(1e-3 - 1e-4 * deviates, 1.959_963_984_540_054e-4);
         let form = RecordedFormFigures {
             pv: RecordedInterval::from_expanded(1e-3, 1e-4),
-            pv_robust: RecordedInterval::from_expanded(1e-3, 1e-4),
+            pv_998: RecordedInterval::from_expanded(1e-3, 1e-4),
             rms,
-            scatter_mm: 3e-4,
+            noise_sigma_mm: 3e-4,
         };
         Figures { form: Some(form), ..figures(1.0, 0.5) }
     };
@@ -366,11 +370,11 @@ fn conformity_by_acceptance_probability() {
         assert_eq!(judged(probability, deviate - 1e-3), near, "{probability}");
     }
     let [pv, rms] = plan().tolerance.compare(&below(1.0));
-    assert!((rms.probability_within.unwrap() - 0.841_345).abs() < 1e-5, "{rms:?}");
+    assert!((rms.probability_in_tolerance.unwrap() - 0.841_345).abs() < 1e-5, "{rms:?}");
     assert_eq!(rms.probability_in_words().unwrap(), "P(in tolerance) = 84.1 %");
     assert_eq!(pv.probability_in_words().unwrap(), "P(in tolerance) > 99.9 %");
     let open = Tolerance { pv_mm: f64::INFINITY, ..plan().tolerance };
-    assert_eq!(open.compare(&below(1.0))[0].probability_within, None);
+    assert_eq!(open.compare(&below(1.0))[0].probability_in_tolerance, None);
     // Whoever has no number accepts nothing.
     assert_eq!(judged(f64::NAN, 5.0), Conformity::Beyond);
     // A plan of an earlier record asks for what was always asked for, and one that asks for that is recorded as it was.
@@ -387,7 +391,7 @@ fn figures_with_form(pv_um: [f64; 3], rms_um: [f64; 3]) -> Figures {
         high_mm: high / 1e3,
         ..RecordedInterval::from_expanded(median / 1e3, 0.0)
     };
-    let form = RecordedFormFigures { pv: of(pv_um), pv_robust: of(pv_um), rms: of(rms_um), scatter_mm: 3e-4 };
+    let form = RecordedFormFigures { pv: of(pv_um), pv_998: of(pv_um), rms: of(rms_um), noise_sigma_mm: 3e-4 };
     Figures { form: Some(form), ..figures(9.0, 1.2) }
 }
 
@@ -506,13 +510,18 @@ fn verdict_accept_undecided_or_stalled() {
 fn outliers_hold_until_remeasured() {
     let left_out = |pv_um: f64, rms_um: f64| {
         let places = "point 17 at (1.0, 2.0) mm by -50.0 um".to_owned();
-        Some(Box::new(OutlierFigures { pv_mm: pv_um / 1e3, rms_mm: rms_um / 1e3, places, again: false }))
+        Some(Box::new(OutlierFigures {
+            pv_mm: pv_um / 1e3,
+            rms_mm: rms_um / 1e3,
+            description: places,
+            can_repeat: false,
+        }))
     };
-    let again = |of: Option<Box<OutlierFigures>>| of.map(|of| Box::new(OutlierFigures { again: true, ..*of }));
+    let again = |of: Option<Box<OutlierFigures>>| of.map(|of| Box::new(OutlierFigures { can_repeat: true, ..*of }));
     // Limits of 7 and 1 um: beyond one of them with the point, so the part is measured again, and accepted without it.
     for (pv_um, rms_um) in [(50.0, 0.9), (6.9, 1.2), (50.0, 1.2)] {
         let mut run = TestRun::new(plan(), |k| Figures {
-            left_out: if k == 1 { left_out(pv_um, rms_um) } else { None },
+            with_outliers: if k == 1 { left_out(pv_um, rms_um) } else { None },
             ..figures(5.0, 0.5)
         });
         run.start().run_to_rest();
@@ -521,7 +530,7 @@ fn outliers_hold_until_remeasured() {
         assert!(
             run.commands
                 .iter()
-                .any(|c| matches!(c, Command::Raise(alarm) if alarm.what.contains("point 17 at (1.0, 2.0) mm")))
+                .any(|c| matches!(c, Command::Raise(alarm) if alarm.event.contains("point 17 at (1.0, 2.0) mm")))
         );
         run.send(resume());
         run.run_to_rest();
@@ -529,7 +538,7 @@ fn outliers_hold_until_remeasured() {
         assert_eq!(run.starts(), [(Device::Grinder, 1), (Device::Cmm, 1), (Device::Cmm, 2)]);
     }
     // The same measurement goes on with the places that can be touched again by themselves, as often as somebody resumes.
-    let mut run = TestRun::new(plan(), |_| Figures { left_out: again(left_out(50.0, 1.2)), ..figures(5.0, 0.5) });
+    let mut run = TestRun::new(plan(), |_| Figures { with_outliers: again(left_out(50.0, 1.2)), ..figures(5.0, 0.5) });
     run.start().run_to_rest();
     for times in 1..=3 {
         assert_eq!(run.verdicts(), vec![Verdict::LeftOut; times]);
@@ -539,11 +548,11 @@ fn outliers_hold_until_remeasured() {
         run.run_to_rest();
     }
     // Where the limits are kept with it too, nothing is open; and where they are not kept without it, another pass is.
-    let mut run = TestRun::new(plan(), |_| Figures { left_out: left_out(6.9, 0.9), ..figures(5.0, 0.5) });
+    let mut run = TestRun::new(plan(), |_| Figures { with_outliers: left_out(6.9, 0.9), ..figures(5.0, 0.5) });
     run.start().run_to_rest();
     assert_eq!(run.verdicts(), [Verdict::Accept]);
     let mut run = TestRun::new(plan(), |k| match k {
-        1 => Figures { left_out: left_out(50.0, 6.5), ..figures(30.0, 6.0) },
+        1 => Figures { with_outliers: left_out(50.0, 6.5), ..figures(30.0, 6.0) },
         _ => figures(5.0, 0.5),
     });
     run.start().run_to_rest();
@@ -714,7 +723,7 @@ fn link_loss_suspends_and_reconciles() {
         let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
         run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
         let device = Device::Grinder;
-        run.send(Event::LinkLost { device, why: "silent".into() });
+        run.send(Event::LinkLost { device, reason: "silent".into() });
         assert_eq!(run.cell.state(), State::Suspended(Phase::Grind(JobStep::Reconcile)));
         let commands = run.send(Event::LinkBack { device, boot_id: 7 });
         assert!(commands.contains(&Command::Reconcile { device, cycle: 1 }), "{commands:?}");
@@ -731,7 +740,7 @@ fn started_job_is_never_restarted() {
     // START was lost on its way: proven not to have begun, and asked for once more.
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Start)));
-    run.send(Event::StartUnknown { device, cycle: 1, why: "silent".into() });
+    run.send(Event::StartUnknown { device, cycle: 1, reason: "silent".into() });
     assert_eq!(run.cell.state(), reconcile);
     run.send(not_started(device));
     assert_eq!(run.cell.state(), State::Execute(Phase::Grind(JobStep::Send)));
@@ -743,10 +752,10 @@ fn started_job_is_never_restarted() {
     ] {
         let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
         run.start().run_until(State::Execute(Phase::Grind(JobStep::Start)));
-        run.send(Event::StartUnknown { device, cycle: 1, why: "silent".into() });
+        run.send(Event::StartUnknown { device, cycle: 1, reason: "silent".into() });
         run.open_commands.clear();
         run.send(seen.clone());
-        run.send(Event::LinkLost { device, why: "silent".into() });
+        run.send(Event::LinkLost { device, reason: "silent".into() });
         run.send(Event::LinkBack { device, boot_id: 7 });
         if matches!(run.cell.state(), State::Held(_)) {
             run.send(resume());
@@ -760,7 +769,7 @@ fn started_job_is_never_restarted() {
     for is_restarted in [false, true] {
         let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
         run.start().run_until(State::Execute(Phase::Grind(JobStep::Start)));
-        run.send(Event::StartUnknown { device, cycle: 1, why: "silent".into() });
+        run.send(Event::StartUnknown { device, cycle: 1, reason: "silent".into() });
         run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Running });
         if is_restarted {
             run.open_commands.clear();
@@ -770,7 +779,7 @@ fn started_job_is_never_restarted() {
             }
             run.open_commands.clear();
         } else {
-            run.send(Event::LinkLost { device, why: "silent".into() });
+            run.send(Event::LinkLost { device, reason: "silent".into() });
             run.send(Event::LinkBack { device, boot_id: 7 });
         }
         let starts = run.starts();
@@ -792,7 +801,7 @@ fn machine_reboot_requires_operator() {
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     let device = Device::Grinder;
-    run.send(Event::LinkLost { device, why: "silent".into() });
+    run.send(Event::LinkLost { device, reason: "silent".into() });
     run.send(Event::LinkBack { device, boot_id: 8 });
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Reconcile)));
     run.open_commands.clear();
@@ -848,7 +857,7 @@ fn failed_gate_holds_and_remeasures() {
 fn figures_outside_gates_hold() {
     let bad = [
         (Figures { shift_mm: 9.0, ..figures(1.0, 0.1) }, AlarmId::PartMisplaced),
-        (Figures { turn_rad: 3.1, ..figures(1.0, 0.1) }, AlarmId::PartMisplaced),
+        (Figures { rotation_rad: 3.1, ..figures(1.0, 0.1) }, AlarmId::PartMisplaced),
         (Figures { coverage: 0.2, ..figures(1.0, 0.1) }, AlarmId::Coverage),
         (Figures { pv_mm: f64::NAN, ..figures(1.0, 0.1) }, AlarmId::RegistrationFailed),
         (Figures { rms_mm: -1.0, ..figures(1.0, 0.1) }, AlarmId::RegistrationFailed),
@@ -900,7 +909,7 @@ fn abort_spares_machine_of_another_run() {
     run.start().run_until(State::Execute(Phase::Measure(JobStep::Run))).open_commands.clear();
     run.send(Event::Restarted { actor: actor() });
     let why = ConnectionRefusal::AtAnotherJob("EXECUTE with job 9, cycle 1".into());
-    run.send(Event::NotConnected { device: Device::Grinder, why });
+    run.send(Event::NotConnected { device: Device::Grinder, reason: why });
     assert!(run.alarms().contains(&AlarmId::NotIdle));
     let commands = run.send(Event::Abort { actor: actor(), reason: String::new() });
     assert!(commands.contains(&Command::AbortMachine { device: Device::Cmm }), "{commands:?}");
@@ -913,7 +922,7 @@ fn declared_over_remeasures_lost_result() {
     run.start().run_until(State::Execute(Phase::Measure(JobStep::Collect))).open_commands.clear();
     run.send(hold());
     let (device, what) = (Device::Cmm, MachineRequest::Collect);
-    run.send(Event::Refused { device, what, why: "it holds no result".into() });
+    run.send(Event::Refused { device, request: what, reason: "it holds no result".into() });
     assert_eq!(run.cell.state(), State::Held(Phase::Measure(JobStep::Collect)));
     run.send(Event::DeclaredOver { actor: actor(), device, evidence: "it was switched off".into() });
     run.run_until(State::Held(Phase::Measure(JobStep::Send)));
@@ -929,7 +938,7 @@ fn declared_over_discards_result_first() {
         let job = |step| if device == Device::Cmm { Phase::Measure(step) } else { Phase::Grind(step) };
         let lost = |run: &mut TestRun| {
             run.start().run_until(State::Execute(job(JobStep::Run)));
-            run.send(Event::LinkLost { device, why: "silent".into() });
+            run.send(Event::LinkLost { device, reason: "silent".into() });
             run.send(hold());
         };
         // The machine may stand there with its result, and would refuse to be prepared for ever.
@@ -948,7 +957,7 @@ fn declared_over_discards_result_first() {
         lost(&mut run);
         run.send(Event::LinkBack { device, boot_id: 8 });
         run.send(over(device));
-        run.send(Event::Refused { device, what: MachineRequest::Acknowledge, why: "HELD with job 9".into() });
+        run.send(Event::Refused { device, request: MachineRequest::Acknowledge, reason: "HELD with job 9".into() });
         assert_eq!(run.cell.state(), State::Held(job(JobStep::Discard)));
         assert!(run.alarms().contains(&AlarmId::MachineRefused));
         assert_eq!(run.send(resume()).last(), Some(&Command::Acknowledge { device }));
@@ -988,7 +997,7 @@ fn uncommanded_motion_holds_again() {
 fn record_failure_prevents_start() {
     let mut run = TestRun::new(plan(), |_| figures(1.0, 0.1));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Prepare)));
-    run.send(Event::RecordFailed { why: RecordFailure::DiskFull("runs".into()) });
+    run.send(Event::RecordFailed { reason: RecordFailure::DiskFull("runs".into()) });
     run.run_to_rest();
     assert_eq!((run.cell.state(), run.starts()), (State::Held(Phase::Grind(JobStep::Send)), vec![]));
     assert_eq!(run.alarms(), [AlarmId::DiskFull]);
@@ -1000,10 +1009,10 @@ fn command_not_on_record_holds_cell() {
         let mut run = TestRun::accepted_after_two_passes();
         run.start().run_until(state).open_commands.clear();
         let commands = run.commands.len();
-        run.send(Event::RecordFailed { why: RecordFailure::DiskFull("runs".into()) });
+        run.send(Event::RecordFailed { reason: RecordFailure::DiskFull("runs".into()) });
         run.send(match state.phase().and_then(Phase::job) {
             Some((device, JobStep::Start)) => {
-                Event::Refused { device, what: MachineRequest::Start, why: "it is not on record".into() }
+                Event::Refused { device, request: MachineRequest::Start, reason: "it is not on record".into() }
             }
             _ => Event::NotOnRecord { command: "the one that was under way".into() },
         });
@@ -1045,7 +1054,7 @@ fn command_not_on_record_holds_cell() {
 #[test]
 fn repeated_failure_holds_after_five() {
     let device = Device::Grinder;
-    let lost = || Event::LinkLost { device, why: "the check number is wrong".into() };
+    let lost = || Event::LinkLost { device, reason: "the check number is wrong".into() };
     let back = || Event::LinkBack { device, boot_id: 7 };
     let raised = |run: &TestRun, id| run.alarms().iter().filter(|alarm| **alarm == id).count();
     let send = Phase::Grind(JobStep::Send);
@@ -1072,7 +1081,7 @@ fn repeated_failure_holds_after_five() {
             break;
         }
         run.run_until(State::Execute(Phase::Grind(JobStep::Start))).open_commands.clear();
-        run.send(Event::StartUnknown { device, cycle: 1, why: "not acknowledged".into() });
+        run.send(Event::StartUnknown { device, cycle: 1, reason: "not acknowledged".into() });
         run.open_commands.clear();
         run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::NotStarted });
     }
@@ -1111,7 +1120,7 @@ fn repeated_failure_holds_after_five() {
     run.start().run_until(State::Execute(run_step));
     let other = Device::Cmm;
     for _ in 0..50 {
-        run.send(Event::LinkLost { device: other, why: "silent".into() });
+        run.send(Event::LinkLost { device: other, reason: "silent".into() });
         run.send(Event::LinkBack { device: other, boot_id: 7 });
         assert_eq!(run.cell.state(), State::Execute(run_step));
     }
@@ -1128,7 +1137,7 @@ fn repeated_failure_holds_after_five() {
 fn flapping_link_holds_or_aborts_motion() {
     let device = Device::Grinder;
     let (run_step, asked) = (Phase::Grind(JobStep::Run), Phase::Grind(JobStep::Reconcile));
-    let lost = || Event::LinkLost { device, why: "the check number is wrong".into() };
+    let lost = || Event::LinkLost { device, reason: "the check number is wrong".into() };
     let back = || Event::LinkBack { device, boot_id: 7 };
     let running = || Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Running };
     let in_vain = || {
@@ -1213,9 +1222,9 @@ fn declared_over_with_active_job() {
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
     run.send(hold());
-    run.send(Event::LinkLost { device, why: "silent".into() });
+    run.send(Event::LinkLost { device, reason: "silent".into() });
     run.send(Event::MachineHeld { device });
-    run.send(Event::LinkLost { device, why: "silent".into() });
+    run.send(Event::LinkLost { device, reason: "silent".into() });
     // It cannot be asked yet: to say so twice changes nothing.
     for _ in 0..2 {
         run.send(over());
@@ -1223,7 +1232,7 @@ fn declared_over_with_active_job() {
     }
     run.send(Event::LinkBack { device, boot_id: 7 });
     assert_eq!(run.send(over()), [Command::Acknowledge { device }]);
-    run.send(Event::Refused { device, what: MachineRequest::Discard, why: "HELD with job 7".into() });
+    run.send(Event::Refused { device, request: MachineRequest::Discard, reason: "HELD with job 7".into() });
     assert_eq!(run.cell.state(), State::Held(asked), "it is found out what it does before anything else moves");
     run.send(resume());
     run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Held });
@@ -1236,7 +1245,7 @@ fn vanished_job_reconciles_and_holds() {
         [(Device::Grinder, State::Held(Phase::Transfer)), (Device::Cmm, State::Held(Phase::Measure(JobStep::Send)))]
     {
         let job = |step| if device == Device::Cmm { Phase::Measure(step) } else { Phase::Grind(step) };
-        let vanished = || Event::JobVanished { device, why: "it is IDLE".into() };
+        let vanished = || Event::JobVanished { device, reason: "it is IDLE".into() };
         type Comes = fn(&mut TestRun);
         let ways: [(&str, Comes, State); 3] = [
             ("at work", |_| {}, State::Execute(job(JobStep::Reconcile))),
@@ -1291,7 +1300,7 @@ fn declared_over_drops_refused_result() {
         run.start().run_until(State::Execute(phase)).open_commands.clear();
         let over = Event::DeclaredOver { actor: actor(), device, evidence: "its panel shows none".into() };
         assert!(matches!(run.send(over.clone())[..], [Command::Refuse { .. }]), "nobody is asked yet");
-        run.send(Event::Refused { device, what: MachineRequest::Acknowledge, why: "another result".into() });
+        run.send(Event::Refused { device, request: MachineRequest::Acknowledge, reason: "another result".into() });
         assert_eq!(run.cell.state(), State::Held(phase));
         run.send(over);
         assert_eq!(run.cell.state(), next);
@@ -1307,7 +1316,11 @@ fn unconfirmed_stop_aborts() {
         run.send(stop());
         assert_eq!(run.cell.state(), State::Stopping);
         if is_told {
-            run.send(Event::Refused { device, what: MachineRequest::Stop, why: "it is EXECUTE 5 s later".into() });
+            run.send(Event::Refused {
+                device,
+                request: MachineRequest::Stop,
+                reason: "it is EXECUTE 5 s later".into(),
+            });
         } else {
             run.now += Duration::from_secs(3600);
             run.send(Event::Deadline);
@@ -1322,7 +1335,7 @@ fn control_lost_raises_alarm() {
     for state in undisturbed_states() {
         let mut run = TestRun::accepted_after_two_passes();
         run.start().run_until(state);
-        run.send(Event::ControlLost { why: String::new() });
+        run.send(Event::ControlLost { reason: String::new() });
         assert_eq!(run.cell.state(), state);
         assert!(run.cell.alarms().any(|alarm| alarm.id == AlarmId::ControlLost));
         run.send(Event::ControlBack);
@@ -1397,7 +1410,7 @@ fn alarm_names_device_code_and_message() {
     run.send(Event::Fault { device: Device::Grinder, code: 5, message: "drive".into() });
     let Some(Command::Raise(alarm)) = run.commands.iter().find(|c| matches!(c, Command::Raise(_))) else { panic!() };
     assert_eq!(alarm.id, AlarmId::MachineFault);
-    assert!(alarm.what.contains("grinder, fault 5, drive"), "{}", alarm.what);
+    assert!(alarm.event.contains("grinder, fault 5, drive"), "{}", alarm.event);
     assert!(AlarmId::ALL.len() > 30);
 }
 
@@ -1442,7 +1455,7 @@ fn lost_while_holding<'f>() -> TestRun<'f> {
     let commands = run.send(hold());
     assert!(commands.contains(&Command::HoldMachine { device: Device::Grinder }), "{commands:?}");
     run.open_commands.clear();
-    run.send(Event::LinkLost { device: Device::Grinder, why: "silent".into() });
+    run.send(Event::LinkLost { device: Device::Grinder, reason: "silent".into() });
     run
 }
 
@@ -1462,7 +1475,7 @@ fn held_requires_machine_confirmation() {
         assert_eq!(commands, [Command::HoldMachine { device }]);
         assert_eq!(run.cell.state(), State::Holding(Phase::Grind(JobStep::Run)));
         assert_eq!(run.cell.next_deadline(), Some(due));
-        run.send(Event::LinkLost { device, why: "silent".into() });
+        run.send(Event::LinkLost { device, reason: "silent".into() });
         assert_eq!(run.cell.next_deadline(), Some(due));
     }
     run.send(Event::LinkBack { device, boot_id: 7 });
@@ -1485,7 +1498,7 @@ fn reconnect_holds_running_machine() {
     let device = Device::Grinder;
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
     run.start().run_until(State::Execute(Phase::Grind(JobStep::Run)));
-    run.send(Event::LinkLost { device, why: "silent".into() });
+    run.send(Event::LinkLost { device, reason: "silent".into() });
     run.send(hold());
     assert_eq!(run.cell.state(), State::Holding(Phase::Grind(JobStep::Reconcile)));
     run.now = run.cell.next_deadline().unwrap();
@@ -1534,7 +1547,7 @@ fn motion_while_held_commands_hold() {
     assert_eq!(run.cell.state(), State::Holding(Phase::Grind(JobStep::Run)), "what moves is not held");
     assert!(run.alarms().contains(&AlarmId::MovesUnasked));
     // It says no: only the safe sequence is left.
-    let commands = run.send(Event::Refused { device, what: MachineRequest::Hold, why: "local".into() });
+    let commands = run.send(Event::Refused { device, request: MachineRequest::Hold, reason: "local".into() });
     assert!(commands.contains(&Command::AbortMachine { device }), "{commands:?}");
     // The machine that has no job of this phase.
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
@@ -1555,15 +1568,18 @@ fn manual_mode_holds_and_blocks_start() {
         let commands = run.send(by_hand(device));
         let Some(Command::Raise(alarm)) = commands.first() else { panic!("{commands:?}") };
         assert_eq!(alarm.id, AlarmId::NotAutomatic);
-        assert!(alarm.what.contains("it is in manual mode"), "{}", alarm.what);
+        assert!(alarm.event.contains("it is in manual mode"), "{}", alarm.event);
         // The machine in manual mode is named, and beside it the grinder, which runs its job.
-        let named = Device::BOTH.map(|other| alarm.what.contains(&other.to_string()));
-        assert_eq!(named, Device::BOTH.map(|other| other == device || other == Device::Grinder), "{}", alarm.what);
+        let named = Device::BOTH.map(|other| alarm.event.contains(&other.to_string()));
+        assert_eq!(named, Device::BOTH.map(|other| other == device || other == Device::Grinder), "{}", alarm.event);
         assert_eq!(commands.last(), Some(&Command::HoldMachine { device: Device::Grinder }));
         run.run_until(State::Held(Phase::Grind(JobStep::Run)));
         // Nobody goes on beside it.
         let commands = run.send(resume());
-        assert!(matches!(&commands[..], [Command::Refuse { why, .. }] if why.contains("manual mode")), "{commands:?}");
+        assert!(
+            matches!(&commands[..], [Command::Refuse { reason, .. }] if why.contains("manual mode")),
+            "{commands:?}"
+        );
         run.send(Event::AutomaticAgain { device });
         assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)), "the key resumes nothing");
         run.send(resume());
@@ -1621,7 +1637,7 @@ fn motion_of_idle_machine_holds_both() {
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)));
     // It does not hold: only the safe sequence is left.
     let why = "local".to_owned();
-    let commands = run.send(Event::Refused { device: strays, what: MachineRequest::Hold, why });
+    let commands = run.send(Event::Refused { device: strays, request: MachineRequest::Hold, reason: why });
     assert!(commands.contains(&Command::AbortMachine { device: strays }), "{commands:?}");
     // Before the START of the other one.
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
@@ -1644,7 +1660,7 @@ fn progress_timeout_alarms_then_holds() {
     let Some(Command::Raise(alarm)) = commands.first() else { panic!("{commands:?}") };
     assert_eq!((alarm.id, commands.len()), (AlarmId::ProgressStands, 1));
     for piece in ["grinder", "for 30 s", "in 30 s"] {
-        assert!(alarm.what.contains(piece), "{piece}: {}", alarm.what);
+        assert!(alarm.event.contains(piece), "{piece}: {}", alarm.event);
     }
     assert_eq!((run.cell.state(), due(&run)), (run_state, 30 * SECOND));
     // It goes on: the alarm goes away by itself.
@@ -1677,7 +1693,7 @@ fn wants_rejects_outdated_commands() {
     run.send(hold());
     assert!(!run.cell.still_requires(&start), "held before it was given");
     run.open_commands.clear();
-    run.send(Event::Refused { device, what: MachineRequest::Start, why: "not given".into() });
+    run.send(Event::Refused { device, request: MachineRequest::Start, reason: "not given".into() });
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Send)));
     run.send(resume());
     run.run_until(State::Execute(Phase::Grind(JobStep::Run)));
@@ -1727,7 +1743,7 @@ fn play_random_events(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> 
             Event::ClearConfirmed { device, .. } => said[*device as usize] = true,
             Event::LoadConfirmed { .. } if before == State::Execute(Phase::Load) => said = [true; 2],
             Event::Reconciled { device, outcome: Reconciliation::NotStarted, .. }
-            | Event::Refused { device, what: MachineRequest::Start, .. }
+            | Event::Refused { device, request: MachineRequest::Start, .. }
                 if !begun[*device as usize] =>
             {
                 *excused.entry(*device).or_default() += 1;
@@ -1751,7 +1767,7 @@ fn play_random_events(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> 
                 Event::MachineHeld { device }
                 | Event::Ended { device, .. }
                 | Event::DeclaredOver { device, .. }
-                | Event::Refused { device, what: MachineRequest::Start, .. }
+                | Event::Refused { device, request: MachineRequest::Start, .. }
                 | Event::Reconciled { device, .. } => stands[device as usize] = true,
                 _ => {}
             }

@@ -15,7 +15,7 @@ use super::{open, read};
 pub(in super::super) struct Copy {
     /// True if the run is also stored on this computer.
     pub(in super::super) is_here: bool,
-    pub(in super::super) told: Value,
+    pub(in super::super) content: Value,
 }
 
 /// Fetches the copy of a run from the database of the plant, and verifies this copy. `keys` are the public keys for the
@@ -76,6 +76,6 @@ pub(in super::super) fn prove(
                 if folder.is_some() { "; the local journal contains these records" } else { "" }
             ))?;
         }
-        Ok(Copy { is_here: folder.is_some(), told })
+        Ok(Copy { is_here: folder.is_some(), content: told })
     })
 }

@@ -19,7 +19,7 @@ pub(in super::super) struct PlantKnowledge {
     /// Learned result from which the task can start; `None` if the other cells have no usable result.
     pub(in super::super) learned: Option<Learned>,
     /// Messages for the operator about results that cannot be used.
-    pub(in super::super) words: Vec<String>,
+    pub(in super::super) description: Vec<String>,
 }
 
 /// Queries the database of the plant for the results that other cells have learned about parts of the same kind.
@@ -56,8 +56,8 @@ pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<Pla
         Ok(Err(error)) => return Ok(without(&error)),
         Err(_) => return Ok(without(&format!("no answer within {} s", PATIENCE.as_secs()))),
     };
-    let words = knowledge.left_alone;
-    Ok(PlantKnowledge { learned: task.learned_from_others(&knowledge.results, &alike), words })
+    let words = knowledge.skipped;
+    Ok(PlantKnowledge { learned: task.learned_from_others(&knowledge.results, &alike), description: words })
 }
 
 /// Estimates how similar the machines of the cells are. The measure is the share of the repeatable error that only one
@@ -78,5 +78,8 @@ fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> MachineSimilari
 }
 
 fn without(why: &str) -> PlantKnowledge {
-    PlantKnowledge { learned: None, words: vec![format!("the plant sends no learned results of other cells: {why}")] }
+    PlantKnowledge {
+        learned: None,
+        description: vec![format!("the plant sends no learned results of other cells: {why}")],
+    }
 }

@@ -53,7 +53,7 @@ pub(super) struct ToUnqueue {
     work: i64,
     /// Reason, for the record
     #[arg(long, value_name = "WORDS", value_parser = name)]
-    why: String,
+    reason: String,
     #[command(flatten)]
     plant: Where,
 }
@@ -93,7 +93,7 @@ pub(super) fn queue(arguments: &ToQueue) -> Result<Outcome, Failure> {
 
 pub(super) fn unqueue(arguments: &ToUnqueue) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
-    let ToUnqueue { work, why, .. } = arguments;
+    let ToUnqueue { work, reason: why, .. } = arguments;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
         let done = link.query("SELECT withdraw_work($1, $2)", &[work, why]).await?;

@@ -85,7 +85,7 @@ pub(super) struct ToWithdraw {
     version: i32,
     /// Reason, for the record
     #[arg(long, value_name = "WORDS", value_parser = name)]
-    why: String,
+    reason: String,
     #[command(flatten)]
     plant: Where,
 }
@@ -180,7 +180,7 @@ pub(super) fn approve(arguments: &ToApprove) -> Result<Outcome, Failure> {
 
 pub(super) fn withdraw(arguments: &ToWithdraw) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
-    let ToWithdraw { name, version, why, .. } = arguments;
+    let ToWithdraw { name, version, reason: why, .. } = arguments;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
         let done = link.query("SELECT withdraw_recipe($1, $2, $3)", &[name, version, why]).await?;

@@ -24,7 +24,7 @@ pub(super) struct ToList {
     part: Option<String>,
     /// Maximum number of entries
     #[arg(long, value_name = "N", default_value_t = 40)]
-    most: u32,
+    max_rows: u32,
     #[command(flatten)]
     plant: Where,
     /// Print JSON instead of text
@@ -66,7 +66,7 @@ Exit codes: 0 listed; 2 the database refuses the command; 3 the database cannot 
 pub(super) struct ToListIncidents {
     /// Maximum number of entries
     #[arg(long, value_name = "N", default_value_t = 40)]
-    most: u32,
+    max_rows: u32,
     #[command(flatten)]
     plant: Where,
     /// Print JSON instead of text
@@ -80,7 +80,7 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
         let link = open(&config).await?;
         let text = "SELECT cell, run, serial, coalesce(result, 'open'), coalesce(to_char(began, 'YYYY-MM-DD HH24:MI:SS'), ''), records
             FROM part_run WHERE $1::text IS NULL OR starts_with(serial, $1) ORDER BY began DESC LIMIT $2";
-        let found = link.query(text, &[&arguments.part, &i64::from(arguments.most)]).await?;
+        let found = link.query(text, &[&arguments.part, &i64::from(arguments.max_rows)]).await?;
         let told = found.iter().map(|row| ([0, 1, 2, 3, 4].map(|k| row.get::<_, String>(k)), row.get::<_, i32>(5)));
         if arguments.json {
             let told = told.map(|([cell, run, serial, result, began], records)| {
@@ -122,7 +122,7 @@ pub(super) fn incidents(arguments: &ToListIncidents) -> Result<Outcome, Failure>
         let link = open(&config).await?;
         let text = "SELECT to_char(i.at, 'YYYY-MM-DD HH24:MI:SS'), coalesce(c.name, i.role), coalesce(i.run, ''), i.what, i.words
             FROM incident i LEFT JOIN cell c ON c.id = i.cell ORDER BY i.id DESC LIMIT $1";
-        let found = link.query(text, &[&i64::from(arguments.most)]).await?;
+        let found = link.query(text, &[&i64::from(arguments.max_rows)]).await?;
         let told = found.iter().map(|row| [0, 1, 2, 3, 4].map(|k| row.get::<_, String>(k)));
         if arguments.json {
             let told = told.map(|[at, by, run, what, words]| {

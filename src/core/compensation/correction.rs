@@ -23,8 +23,8 @@ pub struct Correction {
     /// remains.
     pub level_mm: f64,
     /// Parameter corrections of the machine, in addition to `values_mm`; `None` if the map alone corrects.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub set: Option<ParameterCorrections>,
+    #[serde(rename = "set", default, skip_serializing_if = "Option::is_none")]
+    pub parameters: Option<ParameterCorrections>,
 }
 
 impl Correction {
@@ -32,13 +32,13 @@ impl Correction {
     /// corrections of machine parameters (wheel radius, wheel setting, part tilt). `level_mm` is the height of the
     /// target surface above the nominal surface, in millimetres.
     pub fn zero(grid: Grid, level_mm: f64) -> Self {
-        Self { grid, values_mm: vec![0.0; grid.len()], cycle: 1, level_mm, set: None }
+        Self { grid, values_mm: vec![0.0; grid.len()], cycle: 1, level_mm, parameters: None }
     }
 
     /// Returns true if this correction changes nothing: `values_mm` is 0 at every node, and there are no corrections of
     /// machine parameters (`set` is `None`).
     pub fn is_zero(&self) -> bool {
-        self.set.is_none() && self.values_mm.iter().all(|value| *value == 0.0)
+        self.parameters.is_none() && self.values_mm.iter().all(|value| *value == 0.0)
     }
 
     /// Returns the visible part of this correction at every node, in millimetres. Visible is the part that a
@@ -48,7 +48,7 @@ impl Correction {
     /// The machine parameters are the wheel radius, the wheel setting and the part tilt. A part of their corrections
     /// changes the surface like a motion of the part. Registration removes this part from the measurement.
     pub fn apparent_mm(&self) -> Cow<'_, [f64]> {
-        self.add_parameter_effect(|set| &set.seen_mm)
+        self.add_parameter_effect(|set| &set.apparent_mm)
     }
 
     /// Returns the total displacement of the surface by this correction at every node, in millimetres along the normal.
@@ -58,7 +58,7 @@ impl Correction {
     ///
     /// The amount of removed material follows from this displacement.
     pub fn displacement_mm(&self) -> Cow<'_, [f64]> {
-        self.add_parameter_effect(|set| &set.displaced_mm)
+        self.add_parameter_effect(|set| &set.displacement_mm)
     }
 
     /// Returns the displacement map that the grinder receives, at every node, in millimetres. This is `values_mm` plus
@@ -73,7 +73,7 @@ impl Correction {
     }
 
     fn add_parameter_effect(&self, of: impl Fn(&ParameterCorrections) -> &Vec<f64>) -> Cow<'_, [f64]> {
-        match &self.set {
+        match &self.parameters {
             None => Cow::Borrowed(&self.values_mm),
             Some(set) => self.values_mm.iter().zip(of(set)).map(|(value, of)| value + of).collect(),
         }

@@ -70,20 +70,25 @@ pub enum GainRule {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Band {
     /// Shortest wavelength of the band, in millimetres.
-    pub(super) from_mm: f64,
+    #[serde(rename = "from_mm")]
+    pub(super) min_wavelength_mm: f64,
     /// Ratio p of the variance of the mean to the variance of N; `None` before the first estimate.
-    pub(super) belief: Option<f64>,
+    #[serde(rename = "belief")]
+    pub(super) variance_ratio: Option<f64>,
     /// Weighted sum of the estimates of the variance of N, in square millimetres, and sum of their weights.
-    pub(super) scatter: [f64; 2],
+    #[serde(rename = "scatter")]
+    pub(super) noise_sums: [f64; 2],
     /// Weight of the newest pass in the mean: the Kalman gain g.
-    pub(super) gain: f64,
+    #[serde(rename = "gain")]
+    pub(super) kalman_gain: f64,
     /// Share of the mean that remains after shrinkage, from 0 to 1.
-    pub(super) share: f64,
+    #[serde(rename = "share")]
+    pub(super) shrinkage: f64,
     /// True if the innovation of the last pass was treated as a change of the machine.
     pub(super) changed: bool,
     /// Share of the mean that still comes from other machines; it is no evidence of this machine.
-    #[serde(default, skip_serializing_if = "is_zero")]
-    pub(super) borrowed: f64,
+    #[serde(rename = "borrowed", default, skip_serializing_if = "is_zero")]
+    pub(super) transferred_share: f64,
 }
 
 /// Weighted mean of the observations of R, on the grid of the correction.
@@ -121,7 +126,7 @@ pub struct LearningState {
     pub(super) mean: Option<MeanError>,
     /// Correction of the next pass, in millimetres, on the grid of the correction; `None` before a pass of this part.
     #[serde(skip)]
-    pub(super) wanted_mm: Option<Vec<f64>>,
+    pub(super) next_correction_mm: Option<Vec<f64>>,
 }
 
 /// Error that the next pass is expected to leave.
@@ -176,7 +181,15 @@ impl LearningState {
         let count = edges.len() as f64;
         let band = |from_mm: f64, share: f64, passes: f64| {
             let scatter = repeatability_mm.map_or([0.0; 2], |rms| [passes * rms * rms * share, passes]);
-            Band { from_mm, belief: None, scatter, gain: 1.0, share: 1.0, changed: false, borrowed: 0.0 }
+            Band {
+                min_wavelength_mm: from_mm,
+                variance_ratio: None,
+                noise_sums: scatter,
+                kalman_gain: 1.0,
+                shrinkage: 1.0,
+                changed: false,
+                transferred_share: 0.0,
+            }
         };
         let whole = band(map.cutoff_mm, 1.0, 1.0);
         // Its division between several bands is unknown, so in each band it weighs as one of the many values of a
@@ -195,7 +208,7 @@ impl LearningState {
             whole,
             passes: 0,
             mean: None,
-            wanted_mm: None,
+            next_correction_mm: None,
         }
     }
 
@@ -207,15 +220,13 @@ impl LearningState {
     /// correction is then the same as the correction of this pass.
     pub fn updated(&self, seen: &PassObservation) -> Self {
         let mut known = self.clone();
-        if seen
-            .response
-            .is_some_and(|answer| !matches!(answer.sense, ResponseKind::AsCommanded | ResponseKind::Unclear))
+        if seen.response.is_some_and(|answer| !matches!(answer.kind, ResponseKind::AsCommanded | ResponseKind::Unclear))
         {
-            known.wanted_mm = Some(seen.correction.apparent_mm().into_owned());
+            known.next_correction_mm = Some(seen.correction.apparent_mm().into_owned());
             return known;
         }
         let told = ResampledError::resampled(seen.error, seen.correction.grid);
-        if let Some(answer) = seen.response.filter(|answer| answer.sense == ResponseKind::AsCommanded) {
+        if let Some(answer) = seen.response.filter(|answer| answer.kind == ResponseKind::AsCommanded) {
             known.response = combine_responses(self.response, &answer, self.bands[0].independent(&told));
         }
         let response = known.response[0];
@@ -226,7 +237,7 @@ impl LearningState {
         known.whole.update(told.mean_square(&news), known.whole.independent(&told));
         for (band, news) in known.bands.iter_mut().zip(self.split_bands(&told, news)) {
             band.update(told.mean_square(&news), band.independent(&told));
-            add(&mut mean.values_mm, band.gain, &news);
+            add(&mut mean.values_mm, band.kalman_gain, &news);
         }
         // All points together determine the smooth part: it is used in full, and the bands shrink only the rest.
         let mut believed = seen.explained.map_or_else(|| vec![0.0; told.grid.len()], |smooth| smooth(&mean.values_mm));
@@ -234,9 +245,9 @@ impl LearningState {
         let noise = known.band_noise_mm2(told.noise_mm2);
         for ((band, mean), noise_mm2) in known.bands.iter_mut().zip(self.split_bands(&told, rest)).zip(noise) {
             band.shrink(told.mean_square(&mean), noise_mm2);
-            add(&mut believed, band.share, &mean);
+            add(&mut believed, band.shrinkage, &mean);
         }
-        known.wanted_mm = Some(match self.rule {
+        known.next_correction_mm = Some(match self.rule {
             GainRule::Fixed(share) => {
                 let last = u.iter().zip(&told.error_mm);
                 last.map(|(u, e)| u - share / response * e).collect()
@@ -251,7 +262,7 @@ impl LearningState {
     /// Returns the correction of the next pass at each node of the grid of the last correction, in millimetres. Returns
     /// `None` if no pass of this part has been processed and no state of another machine was taken over.
     pub fn next_correction_mm(&self) -> Option<&[f64]> {
-        self.wanted_mm.as_deref()
+        self.next_correction_mm.as_deref()
     }
 
     /// Returns the state for the start of the next part of the same recipe. The new state contains the learned
@@ -261,11 +272,11 @@ impl LearningState {
     pub fn for_next_part(&self) -> Self {
         let mut known = self.clone();
         for band in known.bands.iter_mut().chain([&mut known.whole]) {
-            band.belief = band.belief.map(|belief| belief + PROCESS_NOISE_TO_NEXT_PART);
+            band.variance_ratio = band.variance_ratio.map(|belief| belief + PROCESS_NOISE_TO_NEXT_PART);
             band.changed = false;
         }
         known.response[1] = known.response[1].hypot(RESPONSE_SIGMA_OF_NEXT_PART);
-        known.wanted_mm = None;
+        known.next_correction_mm = None;
         known
     }
 
@@ -291,8 +302,10 @@ impl LearningState {
             let [n2, taken] = [band.noise_mm2().unwrap_or(noise_mm2), self.compensated_share(band)];
             // Sum of: the repeatable error that is not compensated, the noise that the correction grinds in, the
             // noise of the next pass, and the error from the uncertainty of the response.
-            let left = match (self.rule, band.noise_mm2(), band.belief) {
-                (GainRule::Adaptive | GainRule::Wavelength, Some(_), Some(belief)) => n2 * (1.0 + band.share * belief),
+            let left = match (self.rule, band.noise_mm2(), band.variance_ratio) {
+                (GainRule::Adaptive | GainRule::Wavelength, Some(_), Some(belief)) => {
+                    n2 * (1.0 + band.shrinkage * belief)
+                }
                 _ => (1.0 - taken).powi(2) * (seen2 - n2).max(0.0) + n2 * (1.0 + taken * taken),
             };
             left2 += left + seen2 * (taken * self.response[1]).powi(2);
@@ -306,7 +319,10 @@ impl LearningState {
         let rms_mm = (rest2 + in_common * left2).sqrt();
         // The rms of m independent values varies by 1 / sqrt(2 m), relatively. While N is a guess, so is the
         // forecast.
-        let known = self.bands.iter().all(|band| band.scatter[1] > 0.0 && !(band.is_guessed() && band.borrowed > 0.0));
+        let known = self
+            .bands
+            .iter()
+            .all(|band| band.noise_sums[1] > 0.0 && !(band.is_guessed() && band.transferred_share > 0.0));
         let relative = if known { 1.0 / (2.0 * independent).sqrt() } else { 0.5 };
         Forecast { rms_mm, sigma_mm: relative * rms_mm, floor_mm: known.then(|| (rest2 + whole2).sqrt()) }
     }
@@ -315,7 +331,7 @@ impl LearningState {
     /// is the shortest wavelength of the band in millimetres. `gain` is the share of the newest error that the next
     /// correction compensates in this band; 1 compensates all of the error.
     pub fn gains(&self) -> Vec<[f64; 2]> {
-        self.bands.iter().map(|band| [band.from_mm, self.compensated_share(band)]).collect()
+        self.bands.iter().map(|band| [band.min_wavelength_mm, self.compensated_share(band)]).collect()
     }
 
     /// Returns the share of the newest error that the next correction compensates in `band`, the estimate for one band
@@ -323,7 +339,7 @@ impl LearningState {
     /// share is from 0 to 1. It is the Kalman gain times the Wiener share (the share of the learned mean error that
     /// remains after it was reduced for its noise).
     fn compensated_share(&self, band: &Band) -> f64 {
-        if let GainRule::Fixed(share) = self.rule { share } else { band.gain * band.share }
+        if let GainRule::Fixed(share) = self.rule { share } else { band.kalman_gain * band.shrinkage }
     }
 
     /// Returns the response and its standard uncertainty. The response is the change of the surface divided by the
@@ -350,12 +366,12 @@ impl LearningState {
         let number = |v: f64| v.is_finite() && v >= 0.0;
         let [least, most] = RESPONSE_LIMITS;
         let of_band = |b: &Band| {
-            number(b.from_mm)
-                && b.from_mm > 0.0
-                && b.scatter.iter().all(|v| number(*v))
-                && number(b.gain)
-                && number(b.share)
-                && (0.0..=1.0).contains(&b.borrowed)
+            number(b.min_wavelength_mm)
+                && b.min_wavelength_mm > 0.0
+                && b.noise_sums.iter().all(|v| number(*v))
+                && number(b.kalman_gain)
+                && number(b.shrinkage)
+                && (0.0..=1.0).contains(&b.transferred_share)
         };
         let of_mean = |m: &MeanError| {
             m.grid.is_valid() && m.values_mm.len() == m.grid.len() && m.values_mm.iter().all(|v| v.is_finite())
@@ -364,8 +380,8 @@ impl LearningState {
             && number(self.response[1])
             && self.mean.as_ref().is_none_or(of_mean)
             && (1..=32).contains(&self.bands.len())
-            && self.bands.iter().chain([&self.whole]).all(|b| of_band(b) && b.belief.is_none_or(number))
-            && self.bands.windows(2).all(|w| w[0].from_mm < w[1].from_mm)
+            && self.bands.iter().chain([&self.whole]).all(|b| of_band(b) && b.variance_ratio.is_none_or(number))
+            && self.bands.windows(2).all(|w| w[0].min_wavelength_mm < w[1].min_wavelength_mm)
     }
 
     /// Splits the map `rest` into bands of wavelengths. `rest` has one value for each node. Returns one map for each
@@ -376,7 +392,7 @@ impl LearningState {
         let mut parts = Vec::with_capacity(self.bands.len());
         let whole = rest.clone();
         for longer in &self.bands[1..] {
-            let smooth = told.low_pass(&whole, longer.from_mm);
+            let smooth = told.low_pass(&whole, longer.min_wavelength_mm);
             parts.push(rest.iter().zip(&smooth).map(|(value, smooth)| value - smooth).collect());
             rest = smooth;
         }
@@ -399,8 +415,8 @@ impl LearningState {
     ///
     /// The result applies far from edges. Near the border, the longest waves can contain up to twice as much noise.
     fn band_noise_mm2(&self, whole_mm2: f64) -> Vec<f64> {
-        let first2 = self.bands[0].from_mm.powi(2);
-        let width2 = |k: usize| if k == 0 { 1.0 } else { 1.0 + self.bands[k].from_mm.powi(2) / first2 };
+        let first2 = self.bands[0].min_wavelength_mm.powi(2);
+        let width2 = |k: usize| if k == 0 { 1.0 } else { 1.0 + self.bands[k].min_wavelength_mm.powi(2) / first2 };
         let last = self.bands.len() - 1;
         let between = |k: usize| 1.0 / width2(k) + 1.0 / width2(k + 1) - 4.0 / (width2(k) + width2(k + 1));
         (0..=last).map(|k| whole_mm2 * if k == last { 1.0 / width2(k) } else { between(k) }).collect()
@@ -448,7 +464,7 @@ impl ResampledError {
 
 impl Band {
     pub(super) fn noise_mm2(&self) -> Option<f64> {
-        let [sum, count] = self.scatter;
+        let [sum, count] = self.noise_sums;
         (count > 0.0).then(|| sum / count)
     }
 
@@ -457,7 +473,7 @@ impl Band {
     /// estimates of the variance is then above 0 and below 1, where a full estimate from a pass has the weight 1.
     /// Returns false if the variance is unknown.
     fn is_guessed(&self) -> bool {
-        self.scatter[1] > 0.0 && self.scatter[1] < 1.0
+        self.noise_sums[1] > 0.0 && self.noise_sums[1] < 1.0
     }
 
     /// Updates the Kalman filter of this band after a pass: the noise variance, the Kalman gain, and the variance of
@@ -467,29 +483,30 @@ impl Band {
     /// If the innovation is much larger than expected, the machine is treated as changed, and the gain becomes larger.
     /// If this happens in two consecutive passes, the noise variance is treated as too small and is replaced.
     fn update(&mut self, news_mm2: f64, independent: f64) {
-        let expected = self.belief.zip(self.noise_mm2()).map(|(belief, n2)| (1.0 + belief) * n2);
-        let changed = 1.0 + CHANGED_SIGMAS * (2.0 / independent * (1.0 + 1.0 / self.scatter[1].max(1.0))).sqrt();
+        let expected = self.variance_ratio.zip(self.noise_mm2()).map(|(belief, n2)| (1.0 + belief) * n2);
+        let changed = 1.0 + CHANGED_SIGMAS * (2.0 / independent * (1.0 + 1.0 / self.noise_sums[1].max(1.0))).sqrt();
         let stands_out = expected.is_some_and(|expected| news_mm2 > changed * expected);
-        match self.belief {
+        match self.variance_ratio {
             // This exceeds the known noise: the machine has changed, and the earlier estimate of R counts for little.
             Some(_) if stands_out && !self.changed => {
-                self.belief = self.noise_mm2().map(|n2| news_mm2 / n2 - 1.0).filter(|belief| belief.is_finite());
+                self.variance_ratio =
+                    self.noise_mm2().map(|n2| news_mm2 / n2 - 1.0).filter(|belief| belief.is_finite());
             }
             // A second outlying pass is no change: the noise was underestimated.
-            Some(belief) if stands_out => self.scatter = [news_mm2 / (1.0 + belief), 1.0],
+            Some(belief) if stands_out => self.noise_sums = [news_mm2 / (1.0 + belief), 1.0],
             Some(belief) => {
                 // The uncertainty of a mean from other machines is a guess, and so is the noise that remains after
                 // it.
-                let counts = (1.0 + self.borrowed * belief).powi(-2);
-                self.scatter[0] += counts * news_mm2 / (1.0 + belief);
-                self.scatter[1] += counts;
+                let counts = (1.0 + self.transferred_share * belief).powi(-2);
+                self.noise_sums[0] += counts * news_mm2 / (1.0 + belief);
+                self.noise_sums[1] += counts;
             }
             None => {}
         }
         self.changed = stands_out && !self.changed;
-        self.gain = self.belief.map_or(1.0, |p| p / (1.0 + p));
-        self.belief = Some(self.gain + PROCESS_NOISE);
-        self.borrowed *= 1.0 - self.gain;
+        self.kalman_gain = self.variance_ratio.map_or(1.0, |p| p / (1.0 + p));
+        self.variance_ratio = Some(self.kalman_gain + PROCESS_NOISE);
+        self.transferred_share *= 1.0 - self.kalman_gain;
     }
 
     /// Computes the Wiener share of this band, from 0 to 1, and stores it in `share`. The next correction uses this
@@ -503,11 +520,11 @@ impl Band {
     /// noise of the measured points in this band, in mm². It replaces the variance of the non-repeatable error if this
     /// variance is unknown.
     fn shrink(&mut self, mean_mm2: f64, noise_mm2: f64) {
-        let of_mean_mm2 = self.noise_mm2().unwrap_or(noise_mm2) * self.belief.unwrap_or(1.0);
+        let of_mean_mm2 = self.noise_mm2().unwrap_or(noise_mm2) * self.variance_ratio.unwrap_or(1.0);
         let over = mean_mm2 / of_mean_mm2;
         let share = if self.is_guessed() { 1.0 + (-over).exp_m1() / over } else { 1.0 - over.recip() };
         // 0 / 0: of a mean of 0 all may remain.
-        self.share = if share.is_nan() { 1.0 } else { share.max(0.0) };
+        self.shrinkage = if share.is_nan() { 1.0 } else { share.max(0.0) };
     }
 
     /// Returns how many statistically independent values an error map contains for the waves of this band, at least 1.
@@ -515,7 +532,7 @@ impl Band {
     pub(super) fn independent(&self, told: &ResampledError) -> f64 {
         let [dx, dy] = told.grid.spacing_mm;
         let area_mm2 = dx * dy * told.valid.iter().filter(|valid| **valid).count() as f64;
-        independent_values(area_mm2, self.from_mm)
+        independent_values(area_mm2, self.min_wavelength_mm)
     }
 }
 
@@ -540,7 +557,7 @@ fn combine_responses([before, sigma]: [f64; 2], answer: &Response, independent: 
     if !(least..=most).contains(&answer.slope) {
         return [before, sigma];
     }
-    let of_answer = (answer.unexplained_mm / answer.asked_mm / independent.sqrt()).max(1e-3);
+    let of_answer = (answer.unexplained_mm / answer.commanded_mm / independent.sqrt()).max(1e-3);
     let [w, v] = [sigma, of_answer].map(|s| 1.0 / (s * s));
     [((w * before + v * answer.slope) / (w + v)).clamp(least, most), (w + v).sqrt().recip()]
 }
@@ -639,18 +656,18 @@ mod tests {
         // one far above it nearly all.
         let known = begin(GainRule::Wavelength, Some(1e-3));
         let share = |mean_um: f64| {
-            let mut band = Band { belief: Some(1.0), ..known.bands[0] };
+            let mut band = Band { variance_ratio: Some(1.0), ..known.bands[0] };
             band.shrink(1e-6 * mean_um * mean_um, 0.0);
-            band.share
+            band.shrinkage
         };
         assert!((share((1.0f64 / 3.0).sqrt()) - (-1f64).exp()).abs() < 1e-12, "{}", share((1.0f64 / 3.0).sqrt()));
         assert!((share(10.0) - (1.0 - 1.0 / 300.0)).abs() < 1e-12, "{}", share(10.0));
         assert!(share(1e-3) < 1e-5, "{}", share(1e-3));
         // The estimates of the passes soon outweigh it: 1,200 mm^2 are 48 squares of 5 mm, and the guess weighs as
         // one of these.
-        let mut band = Band { belief: Some(1.0), ..known.bands[0] };
+        let mut band = Band { variance_ratio: Some(1.0), ..known.bands[0] };
         band.update(0.0, 3.0);
-        assert!((band.noise_mm2().unwrap() - 1e-6 / 3.0 / 49.0).abs() < 1e-12, "{:?}", band.scatter);
+        assert!((band.noise_mm2().unwrap() - 1e-6 / 3.0 / 49.0).abs() < 1e-12, "{:?}", band.noise_sums);
         assert!(!band.is_guessed());
     }
 
@@ -660,13 +677,13 @@ mod tests {
         for pass in 1..=4 {
             known = after(&known, &none(), &error_map_of(noise_wave(pass, 1e-3)));
         }
-        let before = known.bands[0].gain;
+        let before = known.bands[0].kalman_gain;
         let changed = after(&known, &none(), &map(|_| 0.02));
-        assert!(before < 0.35 && changed.bands[0].gain > 0.95, "{before} then {}", changed.bands[0].gain);
+        assert!(before < 0.35 && changed.bands[0].kalman_gain > 0.95, "{before} then {}", changed.bands[0].kalman_gain);
         assert_eq!(changed.repeatability_mm(), known.repeatability_mm(), "a change is no scatter");
         let next_part = known.for_next_part();
         let first = after(&next_part, &none(), &error_map_of(noise_wave(5, 1e-3)));
-        assert!(first.bands[0].gain > before, "another part is believed more than another pass");
+        assert!(first.bands[0].kalman_gain > before, "another part is believed more than another pass");
     }
 
     #[test]
@@ -695,9 +712,9 @@ mod tests {
         let answer = Response {
             slope: 0.9,
             correlation: 1.0,
-            asked_mm: 1e-3,
+            commanded_mm: 1e-3,
             unexplained_mm: 0.0,
-            sense: ResponseKind::AsCommanded,
+            kind: ResponseKind::AsCommanded,
         };
         let known = known.updated(&PassObservation {
             correction: &none(),
@@ -733,7 +750,8 @@ mod tests {
             ResponseKind::Turned,
             ResponseKind::Doubled,
         ] {
-            let answer = Response { slope: 0.0, correlation: 0.0, asked_mm: 1e-3, unexplained_mm: 1e-3, sense };
+            let answer =
+                Response { slope: 0.0, correlation: 0.0, commanded_mm: 1e-3, unexplained_mm: 1e-3, kind: sense };
             let twice = first.updated(&PassObservation {
                 correction: &asked,
                 error: &form,
@@ -770,9 +788,9 @@ mod tests {
             let answer = slope.map(|slope| Response {
                 slope,
                 correlation: 1.0,
-                asked_mm: 1.0,
+                commanded_mm: 1.0,
                 unexplained_mm: 0.0,
-                sense: ResponseKind::AsCommanded,
+                kind: ResponseKind::AsCommanded,
             });
             known = known.updated(&PassObservation {
                 correction: &correction,
@@ -795,13 +813,13 @@ mod tests {
         }
         let told = known.repeatability_mm().unwrap();
         assert!((0.6e-3..1.5e-3).contains(&told), "{told}");
-        assert!(known.bands[0].gain < 0.4, "{}", known.bands[0].gain);
+        assert!(known.bands[0].kalman_gain < 0.4, "{}", known.bands[0].kalman_gain);
     }
 
     #[test]
     fn bands_are_octaves_and_add_up() {
         let known = begin(GainRule::Wavelength, None);
-        assert_eq!(known.bands.iter().map(|b| b.from_mm).collect::<Vec<_>>(), [2.5, 5.0, 10.0]);
+        assert_eq!(known.bands.iter().map(|b| b.min_wavelength_mm).collect::<Vec<_>>(), [2.5, 5.0, 10.0]);
         let error = map(|[x, y]| (1.3 * x).sin() + 0.1 * y + (0.2 * x * y).cos());
         let parts = known.split_bands(&ResampledError::resampled(&error, GRID), error.values_mm.clone());
         for (k, value) in error.values_mm.iter().enumerate() {
@@ -903,10 +921,10 @@ mod tests {
         assert!(broken(|k| k.response[1] = f64::NAN));
         assert!(broken(|k| k.bands.clear()));
         assert!(broken(|k| k.bands.swap(0, 1)));
-        assert!(broken(|k| k.bands[1].belief = Some(-1.0)));
-        assert!(broken(|k| k.bands[1].scatter[0] = f64::INFINITY));
-        assert!(broken(|k| k.bands[0].from_mm = 0.0));
-        assert!(broken(|k| k.bands[0].share = f64::NAN));
+        assert!(broken(|k| k.bands[1].variance_ratio = Some(-1.0)));
+        assert!(broken(|k| k.bands[1].noise_sums[0] = f64::INFINITY));
+        assert!(broken(|k| k.bands[0].min_wavelength_mm = 0.0));
+        assert!(broken(|k| k.bands[0].shrinkage = f64::NAN));
         assert!(broken(|k| k.mean.as_mut().unwrap().values_mm.truncate(3)));
         assert!(broken(|k| k.mean.as_mut().unwrap().values_mm[0] = f64::NAN));
         assert!(broken(|k| k.mean.as_mut().unwrap().grid.spacing_mm[0] = 0.0));

@@ -109,7 +109,7 @@ impl MachineSimilarity {
         let (mut shares, mut whole) = (Vec::new(), [0.0; 2]);
         for ((band, a), b) in one.bands.iter().zip(ones).zip(others) {
             let compared = a.zip(b).and_then(|(a, b)| own_and_power(&a, &b));
-            shares.push((band.from_mm, compared.map(|[own_mm2, power_mm2]| (own_mm2 / power_mm2).min(1.0))));
+            shares.push((band.min_wavelength_mm, compared.map(|[own_mm2, power_mm2]| (own_mm2 / power_mm2).min(1.0))));
             let [own_mm2, power_mm2] = compared.unwrap_or_default();
             whole = [whole[0] + own_mm2, whole[1] + power_mm2];
         }
@@ -166,7 +166,7 @@ impl LearningState {
     /// Even a valid state ([`LearningState::is_valid`]) can have such a reason: a learned error without uncertainty, an
     /// implausibly large learned error, or too many nodes.
     pub fn transfer_obstacle(&self) -> Option<String> {
-        if self.bands.iter().any(|band| band.belief.is_some_and(|belief| belief <= 0.0)) {
+        if self.bands.iter().any(|band| band.variance_ratio.is_some_and(|belief| belief <= 0.0)) {
             return Some("a learned mean error has no uncertainty".into());
         }
         let MeanError { grid, values_mm } = self.mean.as_ref()?;
@@ -205,15 +205,17 @@ impl LearningState {
         let on_grid = zero_error(grid);
         for (k, band) in known.bands.iter_mut().enumerate() {
             let of_band: Vec<&BandEvidence> = all.iter().filter_map(|of| of[k].as_ref()).collect();
-            let Some(share) = alike.own_share(band.from_mm).filter(|share| *share <= MAX_OWN_SHARE) else { continue };
+            let Some(share) = alike.own_share(band.min_wavelength_mm).filter(|share| *share <= MAX_OWN_SHARE) else {
+                continue;
+            };
             let Some((values_mm, q)) = predicted(&of_band, share, grid.len()) else { continue };
             let scatter_mm2 = of_band.iter().map(|of| of.noise_mm2).sum::<f64>() / of_band.len() as f64;
             let counts = (VALUES_PER_INDEPENDENT_VALUE * band.independent(&on_grid)).recip();
-            band.scatter = [counts * scatter_mm2, counts];
-            band.belief = Some((q / scatter_mm2).max(MIN_VARIANCE_RATIO));
-            band.borrowed = 1.0;
+            band.noise_sums = [counts * scatter_mm2, counts];
+            band.variance_ratio = Some((q / scatter_mm2).max(MIN_VARIANCE_RATIO));
+            band.transferred_share = 1.0;
             variance_mm2 += q;
-            differ.push([band.from_mm, share.sqrt()]);
+            differ.push([band.min_wavelength_mm, share.sqrt()]);
             mean.values_mm.iter_mut().zip(values_mm).for_each(|(sum, value)| *sum += value);
         }
         if !differ.is_empty() {
@@ -222,7 +224,7 @@ impl LearningState {
             let tell: Vec<&Self> = others.iter().zip(&all).filter(|(_, of)| own(of)).map(|(other, _)| *other).collect();
             known.response = response(&tell, self.response);
             known.whole = whole(&known.whole, &tell, variance_mm2);
-            known.wanted_mm = Some(mean.values_mm.iter().map(|r| -r / known.response[0]).collect());
+            known.next_correction_mm = Some(mean.values_mm.iter().map(|r| -r / known.response[0]).collect());
             known.mean = Some(mean);
         }
         Some(TransferredState { state: known, own_shares: differ })
@@ -230,7 +232,7 @@ impl LearningState {
 }
 
 fn has_same_bands(one: &LearningState, other: &LearningState) -> bool {
-    let same = |(a, b): (&Band, &Band)| (a.from_mm - b.from_mm).abs() <= SAME * a.from_mm;
+    let same = |(a, b): (&Band, &Band)| (a.min_wavelength_mm - b.min_wavelength_mm).abs() <= SAME * a.min_wavelength_mm;
     one.bands.len() == other.bands.len() && one.bands.iter().zip(&other.bands).all(same)
 }
 
@@ -251,10 +253,10 @@ fn band_evidence(known: &LearningState, grid: &Grid) -> Vec<Option<BandEvidence>
     let on_grid = zero_error(*grid);
     let parts = known.split_bands(&on_grid, mean.grid.resample(&mean.values_mm, grid));
     let of_band = |(band, values_mm): (&Band, Vec<f64>)| {
-        let (belief, scatter_mm2) = band.belief.zip(band.noise_mm2())?;
-        let is_told = scatter_mm2 > 0.0 && band.borrowed <= MAX_BORROWED_SHARE;
+        let (belief, scatter_mm2) = band.variance_ratio.zip(band.noise_mm2())?;
+        let is_told = scatter_mm2 > 0.0 && band.transferred_share <= MAX_BORROWED_SHARE;
         // The machine's own part of the mean is what remains without the borrowed share, so its variance is larger.
-        let variance_mm2 = belief * scatter_mm2 / (1.0 - band.borrowed).powi(2);
+        let variance_mm2 = belief * scatter_mm2 / (1.0 - band.transferred_share).powi(2);
         let mean_mm2 = on_grid.mean_square(&values_mm);
         is_told.then_some(BandEvidence { values_mm, mean_mm2, variance_mm2, noise_mm2: scatter_mm2 })
     };
@@ -306,14 +308,14 @@ fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
     let of_others: Vec<f64> = others.iter().filter_map(|other| other.whole.noise_mm2()).collect();
     let others_mm2 = of_others.iter().sum::<f64>() / of_others.len() as f64;
     let scatter = if own.noise_mm2().is_some() || of_others.is_empty() {
-        own.scatter
+        own.noise_sums
     } else {
         let counts = VALUES_PER_INDEPENDENT_VALUE.recip();
         [counts * others_mm2, counts]
     };
-    let with = Band { scatter, ..*own };
+    let with = Band { noise_sums: scatter, ..*own };
     let belief = with.noise_mm2().filter(|n2| *n2 > 0.0).map(|n2| (variance_mm2 / n2).max(MIN_VARIANCE_RATIO));
-    Band { belief, borrowed: 1.0, ..with }
+    Band { variance_ratio: belief, transferred_share: 1.0, ..with }
 }
 
 /// Returns the expected response of a machine and its standard uncertainty. The response is the change of the surface
@@ -360,7 +362,7 @@ mod tests {
     fn machine(rule: GainRule, values_mm: Vec<f64>, [belief, scatter_mm2]: [f64; 2]) -> LearningState {
         let mut known = fresh(rule);
         for band in known.bands.iter_mut().chain([&mut known.whole]) {
-            (band.belief, band.scatter) = (Some(belief), [3.0 * scatter_mm2, 3.0]);
+            (band.variance_ratio, band.noise_sums) = (Some(belief), [3.0 * scatter_mm2, 3.0]);
         }
         known.mean = Some(MeanError { grid: GRID, values_mm });
         known
@@ -392,7 +394,7 @@ mod tests {
         let TransferredState { state: known, own_shares: differ } = begun(&[&one, &one]);
         let values = &known.mean.as_ref().unwrap().values_mm;
         assert!(values.iter().all(|v| (v - 4.0 / 7.0 * 5f64.sqrt()).abs() < 1e-12), "{}", values[0]);
-        assert!((known.bands[0].belief.unwrap() - 10.0 / 7.0).abs() < 1e-12, "{:?}", known.bands);
+        assert!((known.bands[0].variance_ratio.unwrap() - 10.0 / 7.0).abs() < 1e-12, "{:?}", known.bands);
         assert!((differ[0][1] - 0.5f64.sqrt()).abs() < 1e-12 && known.is_valid());
         for (wanted, r) in known.next_correction_mm().unwrap().iter().zip(values) {
             assert_eq!(*wanted, -r / known.response()[0]);
@@ -433,7 +435,7 @@ mod tests {
                     let mut known = machine(rule, of(seed), [1.0, 1.0]);
                     let noise = known.split_bands(&zero_error(GRID), sum(&[(0.05, &field(seed + 1000))]));
                     for (band, noise) in known.bands.iter_mut().zip(noise) {
-                        band.scatter = [power(&noise), 1.0];
+                        band.noise_sums = [power(&noise), 1.0];
                     }
                     known
                 });
@@ -462,7 +464,7 @@ mod tests {
         assert!(values.iter().zip(&turned.0).all(|(a, b)| (a - b).abs() < 1e-12));
         assert!((response[0] - turned.2[0]).abs() < 1e-15 && differ == turned.3);
         for (a, b) in bands.iter().zip(&turned.1) {
-            assert!((a.belief.unwrap() / b.belief.unwrap() - 1.0).abs() < 1e-12);
+            assert!((a.variance_ratio.unwrap() / b.variance_ratio.unwrap() - 1.0).abs() < 1e-12);
         }
     }
 
@@ -479,12 +481,12 @@ mod tests {
             let error = ErrorMap::exact(GRID, values, vec![true; GRID.len()]);
             let seen = PassObservation { correction: &none, error: &error, response: None, explained: None };
             (known, alone) = (known.updated(&seen), alone.updated(&seen));
-            let [of, without] = [&known, &alone].map(|of| of.bands[0].belief.unwrap());
+            let [of, without] = [&known, &alone].map(|of| of.bands[0].variance_ratio.unwrap());
             assert!(of <= without + 1e-12, "pass {pass}: {of} against {without}");
         }
         let [with, without] = [&known, &alone].map(|of| of.gains()[0][1]);
         assert!((with / without - 1.0).abs() < 0.15, "{with} against {without}");
-        assert!(known.bands[0].borrowed < 0.15, "{}", known.bands[0].borrowed);
+        assert!(known.bands[0].transferred_share < 0.15, "{}", known.bands[0].transferred_share);
         assert!((known.mean.as_ref().unwrap().values_mm[0] - 4.98).abs() < 0.01);
     }
 
@@ -492,7 +494,7 @@ mod tests {
     fn borrowed_learning_is_not_shared() {
         let rule = GainRule::Adaptive;
         let (one, mut told) = (machine(rule, field(1), [0.1, 1e-3]), machine(rule, field(1), [0.1, 1e-3]));
-        told.bands[0].borrowed = 0.9;
+        told.bands[0].transferred_share = 0.9;
         let mut alike = MachineSimilarity::default();
         assert!(!alike.compare([&one, &told], true) && alike.comparisons() == 0);
         let shared = fresh(rule).seeded_from(&[&told], &similarity_of(0.1), GRID).unwrap();
@@ -527,7 +529,7 @@ mod tests {
         assert_eq!(honest.transfer_obstacle(), None);
         assert_eq!(fresh(GainRule::Wavelength).transfer_obstacle(), None);
         let mut certain = honest.clone();
-        certain.bands[0].belief = Some(0.0);
+        certain.bands[0].variance_ratio = Some(0.0);
         let mut huge = honest.clone();
         huge.mean.as_mut().unwrap().values_mm[7] = 1e200;
         let mut long = honest.clone();
@@ -549,7 +551,7 @@ mod tests {
         let mut own = machine(rule, values.clone(), [0.3, 1e-8]);
         own.response = [0.9, 0.02];
         let mut borrowed = own.clone();
-        borrowed.bands.iter_mut().for_each(|band| band.borrowed = 0.9);
+        borrowed.bands.iter_mut().for_each(|band| band.transferred_share = 0.9);
         let begun = |others: &[&LearningState]| {
             fresh(rule).seeded_from(others, &similarity_of(0.1), GRID).unwrap().state.response
         };

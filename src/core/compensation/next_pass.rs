@@ -83,9 +83,9 @@ impl Correction {
         let seen_mm = self.apparent_mm();
         let mut values_mm = known.next_correction_mm().unwrap_or(&seen_mm).to_vec();
         if let Some(set) = set {
-            values_mm.iter_mut().zip(&set.seen_mm).for_each(|(value, seen)| *value -= seen);
+            values_mm.iter_mut().zip(&set.apparent_mm).for_each(|(value, seen)| *value -= seen);
         }
-        Self { values_mm, set: set.cloned(), ..self.clone() }
+        Self { values_mm, parameters: set.cloned(), ..self.clone() }
     }
 
     /// Returns the total removal at the node with the largest removal, in millimetres. The total removal is the depth

@@ -45,11 +45,13 @@ pub struct Response {
     /// Correlation of the two changes, from -1 to 1.
     pub correlation: f64,
     /// Root mean square of the commanded change without motions of the part, in millimetres.
-    pub asked_mm: f64,
+    #[serde(rename = "asked_mm")]
+    pub commanded_mm: f64,
     /// Root mean square of the measured change that the commanded one does not explain, in millimetres.
     pub unexplained_mm: f64,
     /// Classification of the response.
-    pub sense: ResponseKind,
+    #[serde(rename = "sense")]
+    pub kind: ResponseKind,
 }
 
 /// Maximum ratio of the unexplained variance of a mirrored or turned map to that of the straight map. With a larger
@@ -103,9 +105,9 @@ pub fn estimate_response(
     Response {
         slope: straight.slope,
         correlation: straight.correlation,
-        asked_mm: straight.commanded_rms,
+        commanded_mm: straight.commanded_rms,
         unexplained_mm: straight.unexplained_rms,
-        sense: classify(&straight, &mirrored, scatter_mm),
+        kind: classify(&straight, &mirrored, scatter_mm),
     }
 }
 
@@ -219,24 +221,24 @@ mod tests {
 
     #[test]
     fn response_classifies_every_sense() {
-        assert_eq!(answered(|x, y| -error(x, y)).sense, ResponseKind::AsCommanded);
-        assert_eq!(answered(|x, y| -0.8 * error(x, y)).sense, ResponseKind::AsCommanded);
-        assert_eq!(answered(error).sense, ResponseKind::Flipped);
-        assert_eq!(answered(|x, y| -error(-x, y)).sense, ResponseKind::MirroredX);
-        assert_eq!(answered(|x, y| -error(x, -y)).sense, ResponseKind::MirroredY);
-        assert_eq!(answered(|x, y| -error(-x, -y)).sense, ResponseKind::Turned);
-        assert_eq!(answered(|x, y| -error(y, -x)).sense, ResponseKind::Turned);
-        assert_eq!(answered(|x, y| -error(-y, x)).sense, ResponseKind::Turned);
-        assert_eq!(answered(|x, y| -2.0 * error(x, y)).sense, ResponseKind::Doubled);
-        assert_eq!(answered(|x, y| -1.2 * error(x, y)).sense, ResponseKind::AsCommanded);
-        assert_eq!(answered(|_, _| 0.0).sense, ResponseKind::NoEffect);
+        assert_eq!(answered(|x, y| -error(x, y)).kind, ResponseKind::AsCommanded);
+        assert_eq!(answered(|x, y| -0.8 * error(x, y)).kind, ResponseKind::AsCommanded);
+        assert_eq!(answered(error).kind, ResponseKind::Flipped);
+        assert_eq!(answered(|x, y| -error(-x, y)).kind, ResponseKind::MirroredX);
+        assert_eq!(answered(|x, y| -error(x, -y)).kind, ResponseKind::MirroredY);
+        assert_eq!(answered(|x, y| -error(-x, -y)).kind, ResponseKind::Turned);
+        assert_eq!(answered(|x, y| -error(y, -x)).kind, ResponseKind::Turned);
+        assert_eq!(answered(|x, y| -error(-y, x)).kind, ResponseKind::Turned);
+        assert_eq!(answered(|x, y| -2.0 * error(x, y)).kind, ResponseKind::Doubled);
+        assert_eq!(answered(|x, y| -1.2 * error(x, y)).kind, ResponseKind::AsCommanded);
+        assert_eq!(answered(|_, _| 0.0).kind, ResponseKind::NoEffect);
     }
 
     #[test]
     fn response_unclear_within_noise() {
         let flat = map(|_, _| 1e-5);
         let none = Correction::zero(GRID, 0.0);
-        assert_eq!(estimate_response([&flat, &flat], [&none, &none], &places(), 1e-4).sense, ResponseKind::Unclear);
-        assert_eq!(estimate_response([&flat, &flat], [&none, &none], &places(), 0.0).sense, ResponseKind::Unclear);
+        assert_eq!(estimate_response([&flat, &flat], [&none, &none], &places(), 1e-4).kind, ResponseKind::Unclear);
+        assert_eq!(estimate_response([&flat, &flat], [&none, &none], &places(), 0.0).kind, ResponseKind::Unclear);
     }
 }

@@ -42,7 +42,8 @@ pub struct Extreme {
     /// Deviation in millimetres.
     pub value_mm: f64,
     /// x and y in the model frame, in millimetres.
-    pub at_mm: [f64; 2],
+    #[serde(rename = "at_mm")]
+    pub place_mm: [f64; 2],
 }
 
 /// Robust peak to valley (PVr): PV of a fit plus three times the rms of its residuals.
@@ -122,7 +123,7 @@ pub fn compute_figures(samples: &[DeviationSample], options: &FormOptions) -> Re
     let samples = remove_forms(&removed, samples)?;
     let points = samples.len();
     let by_value = |a: &&DeviationSample, b: &&DeviationSample| a.deviation_mm.total_cmp(&b.deviation_mm);
-    let extreme = |s: &DeviationSample| Extreme { value_mm: s.deviation_mm, at_mm: s.place_mm };
+    let extreme = |s: &DeviationSample| Extreme { value_mm: s.deviation_mm, place_mm: s.place_mm };
     let (Some(highest), Some(lowest)) = (samples.iter().max_by(by_value), samples.iter().min_by(by_value)) else {
         return Err(FormError::TooFewPoints { points, min_points: 4 });
     };

@@ -25,9 +25,11 @@ pub struct LabelledFigure {
     /// Part removed by the filter, or a note that there was no filter.
     pub cut_off: String,
     /// Method of computation, if the name does not give it.
-    pub made: String,
+    #[serde(rename = "made")]
+    pub method: String,
     /// Position on the part in the model frame, in mm; `None` if the figure does not belong to one place.
-    pub at_mm: Option<[f64; 2]>,
+    #[serde(rename = "at_mm")]
+    pub place_mm: Option<[f64; 2]>,
 }
 
 /// Motions and forms removed from the deviations before any figure is computed.
@@ -79,10 +81,13 @@ pub fn label_figures(figures: &DeviationFigures, taken_out: &RemovedParts) -> Ve
         um("RMS of the points", figures.rms_mm, "of all points, about zero"),
         um("mean", figures.mean_mm, "of all points"),
         LabelledFigure {
-            at_mm: Some(highest.at_mm),
+            place_mm: Some(highest.place_mm),
             ..um("highest (stock left)", highest.value_mm, "the highest point")
         },
-        LabelledFigure { at_mm: Some(lowest.at_mm), ..um("lowest (undercut)", lowest.value_mm, "the lowest point") },
+        LabelledFigure {
+            place_mm: Some(lowest.place_mm),
+            ..um("lowest (undercut)", lowest.value_mm, "the lowest point")
+        },
         labelled_figure("coverage", 100.0 * coverage.share, "%", "nothing", NO_CUT_OFF, &cells),
     ]
 }
@@ -96,7 +101,7 @@ pub fn label_slope(slope: &Slope, taken_out: &RemovedParts) -> Vec<LabelledFigur
     let [x, y] = slope.integration_mm;
     let made = format!("from the map, over {x:.3} mm along x and {y:.3} mm along y, at {} nodes", slope.nodes);
     let urad = |name, rad: f64| labelled_figure(name, 1e6 * rad, "urad", &taken_out.motion, &taken_out.filter, &made);
-    vec![urad("slope RMS", slope.rms_rad), urad("slope, largest", slope.largest_rad)]
+    vec![urad("slope RMS", slope.rms_rad), urad("slope, largest", slope.max_rad)]
 }
 
 fn labelled_figure(
@@ -114,7 +119,7 @@ fn labelled_figure(
         removed: removed.to_owned(),
         direction: DIRECTION,
         cut_off: cut_off.to_owned(),
-        made: made.to_owned(),
-        at_mm: None,
+        method: made.to_owned(),
+        place_mm: None,
     }
 }

@@ -11,9 +11,11 @@ pub struct Slope {
     /// Root mean square of the gradient's length.
     pub rms_rad: f64,
     /// Root mean square of the slopes along x and along y.
-    pub rms_along_rad: [f64; 2],
+    #[serde(rename = "rms_along_rad")]
+    pub axis_rms_rad: [f64; 2],
     /// Largest length of the gradient.
-    pub largest_rad: f64,
+    #[serde(rename = "largest_rad")]
+    pub max_rad: f64,
     /// Integration length along x and along y, in millimetres: an even number of steps of the grid.
     pub integration_mm: [f64; 2],
     /// Number of nodes with a slope.
@@ -58,8 +60,8 @@ pub fn slope(grid: &Grid, values_mm: &[f64], valid: &[bool], integration_mm: f64
     let mean = sums.map(|sum| sum / nodes as f64);
     Ok(Slope {
         rms_rad: (mean[0] + mean[1]).sqrt(),
-        rms_along_rad: mean.map(f64::sqrt),
-        largest_rad: largest,
+        axis_rms_rad: mean.map(f64::sqrt),
+        max_rad: largest,
         integration_mm: length_mm,
         nodes,
     })
@@ -86,8 +88,8 @@ mod tests {
         let all = vec![true; NODES];
         for length in [0.1, 2.0, 3.0, 12.0] {
             let found = slope_of(|x, y| 3e-6 * x - 4e-6 * y + 1.0, &all, length).unwrap();
-            assert!((found.rms_rad - 5e-6).abs() < 1e-15 && (found.largest_rad - 5e-6).abs() < 1e-15);
-            assert!((found.rms_along_rad[0] - 3e-6).abs() < 1e-15);
+            assert!((found.rms_rad - 5e-6).abs() < 1e-15 && (found.max_rad - 5e-6).abs() < 1e-15);
+            assert!((found.axis_rms_rad[0] - 3e-6).abs() < 1e-15);
         }
         assert_eq!(slope_of(|_, _| 0.0, &all, 4.0).unwrap().rms_rad, 0.0);
         let found = slope_of(|_, _| 0.0, &all, 4.9).unwrap();
@@ -100,7 +102,7 @@ mod tests {
         let (k, all) = (std::f64::consts::TAU / 12.0, vec![true; NODES]);
         for length in [2.0, 4.0, 6.0] {
             let expected = (0.5 * k * length).sin() / (0.5 * k * length) * k * 1e-6 / 2f64.sqrt();
-            let found = slope_of(|x, _| 1e-6 * (k * x).sin(), &all, length).unwrap().rms_along_rad[0];
+            let found = slope_of(|x, _| 1e-6 * (k * x).sin(), &all, length).unwrap().axis_rms_rad[0];
             // Not whole waves: a few percent.
             assert!((found / expected - 1.0).abs() < 0.05, "{length}: {found} {expected}");
         }

@@ -27,7 +27,8 @@ pub struct SlopeFigures {
     /// Root mean square of the length of the gradient.
     pub rms: AngleInterval,
     /// Maximum length of the gradient.
-    pub largest: AngleInterval,
+    #[serde(rename = "largest")]
+    pub max: AngleInterval,
     /// Integration length of the slopes.
     pub integration_mm: f64,
     /// Number of places with a slope; places at an edge have none.
@@ -90,7 +91,7 @@ impl SlopeFigures {
             );
             AngleInterval { median_rad: of.median_mm, low_rad: of.low_mm, high_rad: of.high_mm }
         });
-        Self { rms, largest, integration_mm: slopes.integration_mm, places: slopes.nodes }
+        Self { rms, max: largest, integration_mm: slopes.integration_mm, places: slopes.nodes }
     }
 }
 

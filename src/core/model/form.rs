@@ -95,14 +95,14 @@ pub struct Interval {
     /// Lower bound for a decision that is repeated while the measurement grows: the quantile of the probability
     /// [`ModelInputs::decision_risk`].
     #[serde(skip)]
-    pub least_mm: f64,
+    pub decision_low_mm: f64,
     /// Upper bound for a decision that is repeated while the measurement grows: the quantile of the probability 1 -
     /// [`ModelInputs::decision_risk`].
     #[serde(skip)]
-    pub most_mm: f64,
+    pub decision_high_mm: f64,
     /// Bound for acceptance: the quantile of the probability [`ModelInputs::acceptance_probability`].
     #[serde(skip)]
-    pub accepted_mm: f64,
+    pub acceptance_bound_mm: f64,
     /// Quantiles of the probabilities [`Interval::PROBABILITIES`].
     #[serde(skip)]
     pub quantiles_mm: [f64; 15],
@@ -1260,9 +1260,9 @@ impl Interval {
             median_mm: at(0.5),
             low_mm: low(0.025),
             high_mm: at(0.975),
-            least_mm: low(look_risk),
-            most_mm: at(1.0 - look_risk),
-            accepted_mm: at(probability),
+            decision_low_mm: low(look_risk),
+            decision_high_mm: at(1.0 - look_risk),
+            acceptance_bound_mm: at(probability),
             quantiles_mm: Self::PROBABILITIES.map(|share| if share < 0.5 { low(share) } else { at(share) }),
         }
     }

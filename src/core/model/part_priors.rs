@@ -44,7 +44,8 @@ pub struct PartFit {
     /// the logarithm.
     pub range_mm: [f64; 2],
     /// Median and factor of the ratio of the noise to the standard deviation of the field.
-    pub scatter_ratio: [f64; 2],
+    #[serde(rename = "scatter_ratio")]
+    pub noise_ratio: [f64; 2],
     /// Number of parts in the statistics; at most twenty, and later parts replace earlier ones gradually.
     pub parts: u32,
 }
@@ -78,7 +79,7 @@ impl PartPriors {
     pub fn is_valid(&self) -> bool {
         let number = |of: [f64; 2]| of[0].is_finite() && of[0] > 0.0 && of[1].is_finite() && of[1] >= 1.0;
         let is_sound = |lesson: PartFit| {
-            number(lesson.range_mm) && number(lesson.scatter_ratio) && (1..=MAX_PARTS).contains(&lesson.parts)
+            number(lesson.range_mm) && number(lesson.noise_ratio) && (1..=MAX_PARTS).contains(&lesson.parts)
         };
         [self.without_correction, self.with_correction].into_iter().flatten().all(is_sound)
     }
@@ -92,7 +93,7 @@ impl PartFit {
         let [range_mm, ratio] =
             [hyperparameters.field.range_mm, hyperparameters.noise_sigma_mm / hyperparameters.field.sigma_mm];
         let Some(before) = before else {
-            return Self { range_mm: [range_mm, 1.0], scatter_ratio: [ratio, 1.0], parts: 1 };
+            return Self { range_mm: [range_mm, 1.0], noise_ratio: [ratio, 1.0], parts: 1 };
         };
         let n = f64::from((before.parts + 1).min(MAX_PARTS));
         // Online mean and variance (Welford 1962).
@@ -103,7 +104,7 @@ impl PartFit {
         };
         Self {
             range_mm: with(before.range_mm, range_mm),
-            scatter_ratio: with(before.scatter_ratio, ratio),
+            noise_ratio: with(before.noise_ratio, ratio),
             parts: n as u32,
         }
     }
@@ -122,7 +123,7 @@ impl PartFit {
         let parts = machines.len() as u32;
         (parts > 0).then(|| Self {
             range_mm: pooled(|of| of.range_mm),
-            scatter_ratio: pooled(|of| of.scatter_ratio),
+            noise_ratio: pooled(|of| of.noise_ratio),
             parts,
         })
     }
@@ -140,7 +141,7 @@ impl PartFit {
             let variance = squares / (PRIOR_PARTS + n - 1.0) * (1.0 + 1.0 / n);
             [median, variance.sqrt().exp().max(MIN_FACTOR)]
         };
-        Prior { range_mm: expected(self.range_mm), noise_ratio: expected(self.scatter_ratio) }
+        Prior { range_mm: expected(self.range_mm), noise_ratio: expected(self.noise_ratio) }
     }
 }
 
@@ -168,7 +169,7 @@ mod tests {
         // 2)^2.
         assert!((lesson.range_mm[0] - 20.0).abs() < 1e-12 && lesson.parts == 2, "{lesson:?}");
         assert!((lesson.range_mm[1].ln() - 2f64.sqrt() * 2f64.ln()).abs() < 1e-12, "{lesson:?}");
-        assert!((lesson.scatter_ratio[0] - 0.1).abs() < 1e-12 && (lesson.scatter_ratio[1] - 1.0).abs() < 1e-12);
+        assert!((lesson.noise_ratio[0] - 0.1).abs() < 1e-12 && (lesson.noise_ratio[1] - 1.0).abs() < 1e-12);
         let variance = (2.0 * 2.5f64.ln().powi(2) + 2.0 * 2f64.ln().powi(2)) / 3.0 * 1.5;
         assert!((lesson.prior().range_mm[1].ln() - variance.sqrt()).abs() < 1e-12);
         assert!(taught.fit(false).is_none() && taught.is_valid());
@@ -233,8 +234,8 @@ mod tests {
         for bad in [
             PartFit { range_mm: [0.0, 2.0], ..good },
             PartFit { range_mm: [15.0, 0.5], ..good },
-            PartFit { scatter_ratio: [f64::NAN, 2.0], ..good },
-            PartFit { scatter_ratio: [0.1, f64::INFINITY], ..good },
+            PartFit { noise_ratio: [f64::NAN, 2.0], ..good },
+            PartFit { noise_ratio: [0.1, f64::INFINITY], ..good },
             PartFit { parts: 0, ..good },
             PartFit { parts: 21, ..good },
         ] {

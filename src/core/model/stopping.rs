@@ -193,16 +193,16 @@ fn reason_from_form(form: &Form, purpose: &StoppingCriteria, (count, pattern): (
         (form.figures.pv_998, purpose.pv_998_mm),
         (form.figures.rms, purpose.rms_mm),
     ];
-    if figures.iter().all(|(figure, limit)| figure.most_mm <= *limit) {
+    if figures.iter().all(|(figure, limit)| figure.decision_high_mm <= *limit) {
         return Reason::WithinLimits;
     }
     let is_known = form.rms_smooth_sigma_mm <= purpose.correction_sigma_mm;
-    let is_beyond = figures.iter().any(|(figure, limit)| figure.least_mm > *limit);
+    let is_beyond = figures.iter().any(|(figure, limit)| figure.decision_low_mm > *limit);
     let (share, least) = GIVE_UP_LIMITS;
     let gives_up = count >= least.max((share * pattern as f64) as usize);
     // The final judgement is a single decision, so its limit is less strict than that of one decision among many. A
     // part that it can accept gets more touches, not another pass.
-    let is_accepted = figures.iter().all(|(figure, limit)| figure.accepted_mm <= *limit);
+    let is_accepted = figures.iter().all(|(figure, limit)| figure.acceptance_bound_mm <= *limit);
     match () {
         () if is_beyond && !purpose.may_grind => Reason::BeyondLimit,
         () if is_known && (is_beyond || gives_up && purpose.may_grind && !is_accepted) => Reason::FormKnown,

@@ -20,7 +20,8 @@ pub struct Iteration {
     /// Radius of the ball that limited the step, alpha in eq. (15).
     pub ball_radius: f64,
     /// True if the step was accepted. A step that raises the objective is undone.
-    pub taken: bool,
+    #[serde(rename = "taken")]
+    pub accepted: bool,
     /// Number of points in the fit.
     pub points: usize,
 }
@@ -121,7 +122,7 @@ impl Problem<'_> {
             let candidate = self.linearize_at(there, correspondences);
             let Sums { objective_mm2, points, .. } = candidate.sums;
             current = objective_mm2 <= at.sums.objective_mm2;
-            trace.push(Iteration { objective_mm2, step: step.length, ball_radius, taken: current, points });
+            trace.push(Iteration { objective_mm2, step: step.length, ball_radius, accepted: current, points });
             if current {
                 converged = 1.0 - objective_mm2 / at.sums.objective_mm2 <= self.tolerance;
                 if step.length > 0.99 * ball_radius {

@@ -91,8 +91,8 @@ pub fn map_obstacle(found: &Registration, covariance: &Matrix6<f64>, limits: &Ma
     if error_mm <= limit_mm && beside_mm <= limits.max_lateral_mm {
         return None;
     }
-    let seen = found.quality.weak_directions.iter().filter(|w| !w.held);
-    let weak: Vec<&str> = seen.map(|w| w.words.as_str()).collect();
+    let seen = found.quality.weak_directions.iter().filter(|w| !w.is_undetermined);
+    let weak: Vec<&str> = seen.map(|w| w.description.as_str()).collect();
     let weak = if weak.is_empty() { String::new() } else { format!(" ({})", weak.join("; ")) };
     Some(format!(
         "the measured heights are good, but the shape of the part does not determine where they lie on it{weak}. The \
@@ -216,7 +216,7 @@ mod tests {
             residual_sigma_mm: 0.0,
             covariance: Matrix6::from_diagonal(&Vector6::from(sigmas.map(|s| s * s))),
             condition: 1.0,
-            weak_directions: vec![WeakDirection { words, held: false, sigma_mm: Some(3.4) }],
+            weak_directions: vec![WeakDirection { description, is_undetermined: false, sigma_mm: Some(3.4) }],
             coverage: 1.0,
             alternatives: Vec::new(),
             warnings: Vec::new(),

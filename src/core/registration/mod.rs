@@ -182,11 +182,11 @@ fn with_final_state(
         // Sums in another order differ by rounding. If the points lie on the surface, the sums contain nothing else.
         taken.points == used && off_mm2 <= 1e-9 * objective_mm2 + used as f64 * ROUNDING_MM * ROUNDING_MM
     };
-    let told = trace.iter().rfind(|turn| turn.taken).filter(is_told).map(|turn| turn.objective_mm2);
-    if told.is_none() || !trace.last().is_some_and(|last| last.taken) {
+    let told = trace.iter().rfind(|turn| turn.accepted).filter(is_told).map(|turn| turn.objective_mm2);
+    if told.is_none() || !trace.last().is_some_and(|last| last.accepted) {
         let (ball_radius, objective_mm2) =
             (trace.last().map_or(options.ball_radius, |last| last.ball_radius), told.unwrap_or(objective_mm2));
-        trace.push(Iteration { objective_mm2, step: 0.0, ball_radius, taken: true, points: used });
+        trace.push(Iteration { objective_mm2, step: 0.0, ball_radius, accepted: true, points: used });
     }
     trace
 }

@@ -58,10 +58,12 @@ pub struct RegistrationQuality {
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct WeakDirection {
     /// Description, for example "x and y position repeats only to 3.4 mm".
-    pub words: String,
+    #[serde(rename = "words")]
+    pub description: String,
     /// True if the surface does not determine the direction at all. The pose then stays at its start value in this
     /// direction.
-    pub held: bool,
+    #[serde(rename = "held")]
+    pub is_undetermined: bool,
     /// Standard uncertainty of a shift, or of the rim under a rotation, in millimetres; `None` if the direction is
     /// undetermined.
     pub sigma_mm: Option<f64>,
@@ -238,8 +240,8 @@ fn undetermined_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scali
     words
         .into_iter()
         .map(|w| WeakDirection {
-            words: format!("{w}: not determined by the shape; the pose keeps its start value"),
-            held: true,
+            description: format!("{w}: not determined by the shape; the pose keeps its start value"),
+            is_undetermined: true,
             sigma_mm: None,
         })
         .collect()
@@ -349,7 +351,7 @@ fn uncertain_directions(
                     format_length(at_rim[worst])
                 )
             };
-            found.push(WeakDirection { words, held: false, sigma_mm: Some(at_rim[worst]) });
+            found.push(WeakDirection { description: words, is_undetermined: false, sigma_mm: Some(at_rim[worst]) });
             rest = others;
         }
     }

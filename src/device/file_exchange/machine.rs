@@ -44,7 +44,7 @@ struct FolderMachine<M: Exchange> {
     notes: Vec<String>,
     owned: bool,
     /// True if this machine cannot reach the part while the part is at the other machine.
-    apart: bool,
+    cannot_reach_part: bool,
     /// True if this machine is clear of the part; `None` if that is unknown. It becomes true when a person confirms the
     /// end of a pass. The arrival of a file does not make it true.
     clear_of_part: Option<bool>,
@@ -72,7 +72,7 @@ impl<M: Exchange> ExchangeMachine<M> {
             start_confirmed: false,
             notes: Vec::new(),
             owned: false,
-            apart: false,
+            cannot_reach_part: false,
             clear_of_part: None,
         };
         Self { name, timeout: answers_within, made: Instant::now(), machine: Arc::new(Mutex::new(machine)) }
@@ -82,7 +82,7 @@ impl<M: Exchange> ExchangeMachine<M> {
     /// status of this machine always says that the machine is clear of the part. Returns the changed machine.
     #[must_use]
     pub fn apart(self, apart: bool) -> Self {
-        self.machine.lock().unwrap_or_else(PoisonError::into_inner).apart = apart;
+        self.machine.lock().unwrap_or_else(PoisonError::into_inner).cannot_reach_part = apart;
         self
     }
 
@@ -185,7 +185,7 @@ impl<M: Exchange> FolderMachine<M> {
             job: self.job.map(|(job, _)| job),
             done: self.done,
             outcome: self.outcome,
-            clear_of_part: if self.apart { Some(true) } else { self.clear_of_part },
+            clear_of_part: if self.cannot_reach_part { Some(true) } else { self.clear_of_part },
             ..Status::from_state(self.state)
         }
     }

@@ -28,7 +28,7 @@ pub(super) struct LineRules {
     /// Required angle of the rotary table and its tolerance, in degrees.
     pub(super) rotary_deg: [f64; 2],
     /// Beginnings of lines that are ignored.
-    pub(super) passed_over: Vec<String>,
+    pub(super) ignored_prefixes: Vec<String>,
 }
 
 /// Requested measurement, current or finished.
@@ -73,8 +73,8 @@ struct LoggedLine<'a> {
     line: &'a str,
     #[serde(skip_serializing_if = "Option::is_none")]
     target: Option<u32>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    passed_over: Option<&'a str>,
+    #[serde(rename = "passed_over", skip_serializing_if = "Option::is_none")]
+    ignored: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     refused: Option<&'a str>,
 }
@@ -110,7 +110,7 @@ impl RequestedMeasurement {
     fn log_line(&self, line: &str, target: Option<u32>, passed_over: Option<&str>, refused: Option<&str>) {
         let at_s = self.begun.elapsed().as_secs_f64();
         if let Some(kept) = &self.line_log {
-            kept.append(&LoggedLine { at_s, line, target, passed_over, refused });
+            kept.append(&LoggedLine { at_s, line, target, ignored: passed_over, refused });
         }
     }
 
@@ -156,7 +156,8 @@ impl MeasurementSession {
     }
 
     fn line(&mut self, line: &str) {
-        let begins = self.rules.passed_over.iter().any(|beginning| line.trim_start().starts_with(beginning.as_str()));
+        let begins =
+            self.rules.ignored_prefixes.iter().any(|beginning| line.trim_start().starts_with(beginning.as_str()));
         if begins {
             if let Some(asked) = self.measurement.as_mut().filter(|_| self.state.is_moving()) {
                 asked.lines += 1;
@@ -329,8 +330,11 @@ mod tests {
     use regrind_formats::result::Coordinates;
 
     fn session(targets: u32) -> MeasurementSession {
-        let judging =
-            LineRules { parser: LineParser::default(), rotary_deg: [0.0, 0.05], passed_over: vec!["PROBE".to_owned()] };
+        let judging = LineRules {
+            parser: LineParser::default(),
+            rotary_deg: [0.0, 0.05],
+            ignored_prefixes: vec!["PROBE".to_owned()],
+        };
         let mut hearing = MeasurementSession::new(judging);
         let list = TargetList::new(&plan(targets), Coordinates::Centres, false, RULES);
         let job = Job { job: 7, cycle: 1, digest: 1 };

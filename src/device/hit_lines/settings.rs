@@ -191,13 +191,13 @@ pub struct HitLinesSettings {
     /// Maximum distance of a point from its target, in mm.
     pub limit_mm: f64,
     /// Time within which an identical line is the same touch.
-    pub double_within: Duration,
+    pub duplicate_window: Duration,
     /// Handling of a second touch of a target.
     pub repeated: Repeated,
     /// Timeout of the rest of a line.
     pub line_timeout: Duration,
     /// Beginnings of lines that are ignored.
-    pub passed_over: Vec<String>,
+    pub ignored_prefixes: Vec<String>,
     /// Time after the last point at which the probe is clear of the part; `None` if a person confirms it.
     pub clear_after: Option<Duration>,
     /// Minimum number of points, if any points are accepted.
@@ -213,13 +213,13 @@ pub struct HitLinesSettings {
 
 impl HitLinesSettings {
     pub(super) fn line_rules(&self) -> LineRules {
-        let passed_over = self.passed_over.clone();
-        LineRules { parser: self.parser, rotary_deg: self.rotary_deg, passed_over }
+        let passed_over = self.ignored_prefixes.clone();
+        LineRules { parser: self.parser, rotary_deg: self.rotary_deg, ignored_prefixes: passed_over }
     }
 
     pub(super) fn touch_rules(&self) -> TouchRules {
-        let Self { limit_mm, double_within, repeated, .. } = *self;
-        TouchRules { limit_mm, double_within, repeated }
+        let Self { limit_mm, duplicate_window: double_within, repeated, .. } = *self;
+        TouchRules { limit_mm, duplicate_window: double_within, repeated }
     }
 
     pub(super) fn timeouts(&self) -> LinkTimeouts {
@@ -270,10 +270,10 @@ impl DriverFactory for HitLinesWire {
             coordinates: self.coordinates.unwrap_or(Coordinates::Centres),
             rotary_deg: [self.rotary_deg, self.rotary_tolerance_deg],
             limit_mm: self.limit_mm,
-            double_within: ms(self.duplicate_window_ms),
+            duplicate_window: ms(self.duplicate_window_ms),
             repeated: self.repeated_touch,
             line_timeout: ms(self.line_timeout_ms),
-            passed_over: self.ignored_prefixes.clone(),
+            ignored_prefixes: self.ignored_prefixes.clone(),
             clear_after: self.clear_after_s.map(Duration::from_secs_f64),
             min_free_points: making.min_free_points,
             connect_timeout: making.timing.lost_after,

@@ -25,7 +25,7 @@ pub(super) struct TouchRules {
     /// Maximum distance of a point from its target, in mm; a point farther from every target belongs to none.
     pub(super) limit_mm: f64,
     /// Time within which an identical line counts as a repetition of the same touch.
-    pub(super) double_within: Duration,
+    pub(super) duplicate_window: Duration,
     pub(super) repeated: Repeated,
 }
 
@@ -87,7 +87,7 @@ impl TargetList {
     /// returns the reason if that target was already touched and the touch rules do not allow replacement.
     pub(super) fn assign(&mut self, line: &str, at_mm: [f64; 3], came: Duration) -> Result<TouchAssignment, String> {
         let before = self.last.replace((line.to_owned(), came));
-        let within = |at: Duration| came.saturating_sub(at) < self.rules.double_within;
+        let within = |at: Duration| came.saturating_sub(at) < self.rules.duplicate_window;
         if before.is_some_and(|(text, at)| text == line && within(at)) {
             return Ok(TouchAssignment::DuplicateLine);
         }
@@ -192,7 +192,7 @@ pub(super) mod tests {
     }
 
     pub(in super::super) const RULES: TouchRules =
-        TouchRules { limit_mm: 1.0, double_within: Duration::from_millis(200), repeated: Repeated::Refuse };
+        TouchRules { limit_mm: 1.0, duplicate_window: Duration::from_millis(200), repeated: Repeated::Refuse };
 
     fn at(ms: u64) -> Duration {
         Duration::from_millis(ms)

@@ -80,16 +80,19 @@ pub struct Amended {
     /// Number of arcs, as read.
     pub arcs: u64,
     /// Number of arcs that stayed arcs.
-    pub arcs_kept: u64,
+    #[serde(rename = "arcs_kept")]
+    pub arcs_unchanged: u64,
     /// Number of moves at feed that were written.
     pub written: u64,
     /// Largest displacement of a point, in millimetres.
-    pub largest_mm: f64,
+    #[serde(rename = "largest_mm")]
+    pub max_shift_mm: f64,
     /// Length of the moves at feed, in millimetres.
     pub feed_mm: f64,
     /// Length of the moves at feed that lie outside the map, in millimetres. There the values at the border of the map
     /// are used.
-    pub beside_map_mm: f64,
+    #[serde(rename = "beside_map_mm")]
+    pub outside_map_mm: f64,
     /// True if the program has neither G20 nor G21 before its first coordinate, so that millimetres were assumed and
     /// written.
     pub unit_assumed: bool,
@@ -152,8 +155,8 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
             "check that the file is the program of the pass",
         ));
     }
-    if done.beside_map_mm > MAX_SHARE_OUTSIDE_MAP * done.feed_mm {
-        let over_mm = done.feed_mm - done.beside_map_mm;
+    if done.outside_map_mm > MAX_SHARE_OUTSIDE_MAP * done.feed_mm {
+        let over_mm = done.feed_mm - done.outside_map_mm;
         let what = format!("only {over_mm:.3} mm of {:.3} mm at feed lie over the map", done.feed_mm);
         let remedy =
             "check that the map is in the frame of the program; check the unit and the decimal points of the program";
@@ -414,7 +417,7 @@ impl<'a> Rewriter<'a> {
         }
         match arc {
             Some(arc) => {
-                self.done.arcs_kept += 1;
+                self.done.arcs_unchanged += 1;
                 self.arc_to(arc, &corrected[0], &corrected[count]);
             }
             None => {
@@ -483,7 +486,7 @@ impl<'a> Rewriter<'a> {
             );
             return Err((found, "check the map and its unit, or raise --max-correction-um"));
         }
-        self.done.largest_mm = self.done.largest_mm.max(largest_mm);
+        self.done.max_shift_mm = self.done.max_shift_mm.max(largest_mm);
         let count = shifts.len() - 1;
         let beside = (0..count).filter(|&k| {
             let at = way((k as f64 + 0.5) / count as f64);
@@ -493,7 +496,7 @@ impl<'a> Rewriter<'a> {
         // A move without change of position has no length, but has a place.
         let length = length.max(1e-6);
         self.done.feed_mm += length;
-        self.done.beside_map_mm += if share == 1.0 { length } else { share * length };
+        self.done.outside_map_mm += if share == 1.0 { length } else { share * length };
         Ok(())
     }
 

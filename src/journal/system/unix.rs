@@ -130,7 +130,7 @@ pub(crate) struct LockFolder {
 
 /// Reason why a folder for locks cannot be used, with the remedy.
 pub(crate) struct BadFolder {
-    pub(crate) what: String,
+    pub(crate) description: String,
     pub(crate) remedy: String,
 }
 
@@ -149,7 +149,7 @@ impl LockFolder {
                  creates it for a group",
                 path.display()
             );
-            BadFolder { what, remedy }
+            BadFolder { description: what, remedy }
         };
         let failed = |action: &str, error: Errno| bad(format!("{action}: {}", io::Error::from(error)));
         let place = rustix::fs::open(place, AS_FOLDER, Mode::empty())
@@ -165,7 +165,7 @@ impl LockFolder {
         let folder = opened.map_err(|error| match error {
             Errno::LOOP | Errno::NOTDIR => bad("it is a link or a file".to_owned()),
             Errno::ACCESS => BadFolder {
-                what: "it is only for the users of a group".to_owned(),
+                description: "it is only for the users of a group".to_owned(),
                 remedy: format!(
                     "have root add you to that group (`stat -c %G {}` shows the group, `usermod -aG GROUP NAME` \
                      adds), and sign in again",

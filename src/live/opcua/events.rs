@@ -90,7 +90,7 @@ pub(super) fn events_between([before, on]: [&CellStatus; 2], now: &CellStatus, o
         for alarm in new_alarms(earlier, snapshot) {
             let remedy = alarm.remedy.join("\n");
             let values = vec![text(run), snapshot.simulation.into(), text(&alarm.consequence), text(&remedy)];
-            events.push(from(&ALARM, TO_BE_SEEN_TO, alarm.what.clone(), values));
+            events.push(from(&ALARM, TO_BE_SEEN_TO, alarm.event.clone(), values));
         }
     }
     if let Some(last) = now.last_run.as_ref().filter(|last| before.last_run.as_ref() != Some(last)) {

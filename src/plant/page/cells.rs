@@ -20,13 +20,13 @@ pub(super) struct CellSummary {
     heard_s: Option<f64>,
     run: Option<String>,
     state: String,
-    words: String,
+    description: String,
     simulation: bool,
     part: String,
     serial: String,
     cycle: Option<[i32; 2]>,
     done: Option<[i32; 2]>,
-    left_s: Option<[f64; 2]>,
+    remaining_s: Option<[f64; 2]>,
     alarms: i32,
     next: String,
 }
@@ -100,13 +100,13 @@ impl CellSummary {
             heard_s: row.get(1),
             run: row.get(2),
             state: row.get(3),
-            words: row.get(4),
+            description: row.get(4),
             simulation: row.get(5),
             part: row.get(6),
             serial: row.get(7),
             cycle: pair(8),
             done: pair(10),
-            left_s: left(12),
+            remaining_s: left(12),
             alarms: row.get(14),
             next: row.get(15),
         }
@@ -167,14 +167,14 @@ fn card(cell: &CellSummary) -> Markup {
             }
             @if look == DisplayState::Silent {
                 p .state { strong { (cell.heard()) } }
-                p { "Its present state is unknown." @if !cell.words.is_empty() { " Last report: " (shown(&cell.words)) } }
+                p { "Its present state is unknown." @if !cell.description.is_empty() { " Last report: " (shown(&cell.description)) } }
                 (of_part(cell))
             } @else {
-                p .state { strong { (shown(if cell.words.is_empty() { &cell.state } else { &cell.words })) } }
+                p .state { strong { (shown(if cell.description.is_empty() { &cell.state } else { &cell.description })) } }
                 (of_part(cell))
                 @if let Some([done, total]) = cell.done {
                     progress max=(total.max(1)) value=(done.clamp(0, total.max(1))) aria-label="of the job under way" {}
-                    p .left { (done) " of " (total) @if let Some(left) = cell.left_s { ", " strong { (range(left)) } " left" } }
+                    p .left { (done) " of " (total) @if let Some(left) = cell.remaining_s { ", " strong { (range(left)) } " left" } }
                 }
                 @if cell.alarms > 0 { p .alarms { strong { (cell.alarms) @if cell.alarms == 1 { " alarm" } @else { " alarms" } } } }
                 @if !cell.next.is_empty() && matches!(look, DisplayState::Held | DisplayState::Alarm) { p { "Next: " (shown(&cell.next)) } }
@@ -207,13 +207,13 @@ mod tests {
             heard_s,
             run: Some("r&s".into()),
             state: state.into(),
-            words: String::new(),
+            description: String::new(),
             simulation: true,
             part: "<i>".into(),
             serial: "\u{202e}42".into(),
             cycle: Some([2, 6]),
             done: Some([30, 300]),
-            left_s: Some([80.0, 130.0]),
+            remaining_s: Some([80.0, 130.0]),
             alarms,
             next: String::new(),
         }

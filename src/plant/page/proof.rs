@@ -30,7 +30,7 @@ pub(super) struct Proof {
     /// Time of the proof, UTC.
     pub(super) at: String,
     /// Result of the verification; otherwise a text that says why the copy is not trustworthy.
-    pub(super) found: Result<Verified, String>,
+    pub(super) outcome: Result<Verified, String>,
     /// Number of keys that the plant has for the cell.
     pub(super) keys: usize,
     /// Report of the run, and its results as QIF and as DFQ; otherwise a text why there are none.
@@ -123,7 +123,7 @@ async fn prove(plant: &PlantPage, cell: &str, name: &str) -> Result<Proof, Plant
             report: run_report(&folder).map_err(words),
             qif: run_results(&folder, ResultsFormat::Qif).map_err(words),
             dfq: run_results(&folder, ResultsFormat::Dfq).map_err(words),
-            found,
+            outcome: found,
         }
     });
     let failed =
@@ -135,7 +135,7 @@ impl Proof {
     fn failed(run: &PlantRun, why: &str) -> Self {
         let why = why.to_owned();
         let none = || Err(why.clone());
-        Self { at: now(), found: Err(why.clone()), keys: run.keys.len(), report: none(), qif: none(), dfq: none() }
+        Self { at: now(), outcome: Err(why.clone()), keys: run.keys.len(), report: none(), qif: none(), dfq: none() }
     }
 }
 

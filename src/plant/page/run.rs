@@ -115,7 +115,7 @@ async fn made(plant: &Shared, id: i32) -> Result<PageContent, PageError> {
             (about(&run))
             h2 { "The copy of the plant" }
             (proof_text(proof.as_deref()))
-            @if let Some(proof) = proof.as_ref().filter(|proof| proof.found.is_ok()) { (made_of_it(&run, proof)) }
+            @if let Some(proof) = proof.as_ref().filter(|proof| proof.outcome.is_ok()) { (made_of_it(&run, proof)) }
             h2 { "Cycles" }
             (cycles)
             @if let Some(first) = maps.first() {
@@ -159,7 +159,7 @@ fn proof_text(proof: Option<&Proof>) -> Markup {
         return html! { p role="status" { "The copy is being fetched and verified; this page then shows the result by itself." } };
     };
     html! {
-        @match &proof.found {
+        @match &proof.outcome {
             Ok(found) => {
                 p .proven { strong { "Proven" } " at " (proof.at) " UTC: " (found.records) " records in an unbroken chain and " (found.artefacts) " unchanged files"
                     @if found.signed == 0 { "; not signed" }

@@ -211,12 +211,12 @@ fn alarms() -> String {
     for (k, id) in AlarmId::ALL.iter().enumerate() {
         let alarm = id.generic_alarm();
         let name = serde_json::to_value(id).unwrap();
-        let _ = writeln!(text, "{}### {}\n", if k == 0 { "" } else { "\n" }, alarm.what.trim_end_matches('.'));
+        let _ = writeln!(text, "{}### {}\n", if k == 0 { "" } else { "\n" }, alarm.event.trim_end_matches('.'));
         let _ = writeln!(text, "{}\n", alarm.consequence);
         for (k, line) in alarm.remedy.iter().enumerate() {
             let _ = writeln!(text, "{}. {line}", k + 1);
         }
-        let _ = writeln!(text, "\nCleared by: {}. In the record: `{}`.", who(alarm.clears), name.as_str().unwrap());
+        let _ = writeln!(text, "\nCleared by: {}. In the record: `{}`.", who(alarm.cleared_by), name.as_str().unwrap());
     }
     text
 }

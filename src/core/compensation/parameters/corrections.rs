@@ -108,13 +108,15 @@ pub struct ParameterCorrections {
     pub since_cycle: u16,
     /// Displacement of the surface along its normal by these corrections, at every node of the correction, in
     /// millimetres.
-    pub displaced_mm: Vec<f64>,
+    #[serde(rename = "displaced_mm")]
+    pub displacement_mm: Vec<f64>,
     /// Part of `displaced_mm` that setting and tilt cause. A grinder has an input for its wheel radius, but can apply
     /// setting and tilt only through its map.
     pub setting_mm: Vec<f64>,
     /// Part of `displaced_mm` that remains after registration: a map without these corrections would have to contain
     /// it.
-    pub seen_mm: Vec<f64>,
+    #[serde(rename = "seen_mm")]
+    pub apparent_mm: Vec<f64>,
 }
 
 impl ParameterCorrections {
@@ -143,7 +145,7 @@ impl ParameterCorrections {
         let displaced_mm: Vec<f64> = nodes.iter().map(|node| of(node, None)).collect();
         let setting_mm = nodes.iter().map(|node| of(node, Some(ParameterKind::WheelRadius))).collect();
         let seen_mm = nodes.iter().zip(&displaced_mm).map(|(node, of)| of - motion.at(node)).collect();
-        Some(Self { values, since_cycle, displaced_mm, setting_mm, seen_mm })
+        Some(Self { values, since_cycle, displacement_mm: displaced_mm, setting_mm, apparent_mm: seen_mm })
     }
 
     /// Returns the correction of one parameter: its difference from the value stated in the recipe, in millimetres or
@@ -154,7 +156,7 @@ impl ParameterCorrections {
 
     /// Returns true if every number is finite and each vector has `nodes` values.
     pub fn is_valid(&self, nodes: usize) -> bool {
-        let each = [&self.displaced_mm, &self.setting_mm, &self.seen_mm];
+        let each = [&self.displacement_mm, &self.setting_mm, &self.apparent_mm];
         self.values.iter().all(|v| v.is_finite())
             && each.iter().all(|of| of.len() == nodes && of.iter().all(|v| v.is_finite()))
     }

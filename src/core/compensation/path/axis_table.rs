@@ -97,7 +97,7 @@ mod tests {
         let heights: Vec<f64> = (0..41 * 41).map(|k| 0.5 * (f64::from(k % 41) - 20.0)).collect();
         let slope = HeightField::hermite(on, &heights, &vec![[0.5, 0.0]; 41 * 41]);
         let grid = Grid { columns: 3, rows: 3, first_mm: [-2.0, -2.0], spacing_mm: [2.0, 2.0] };
-        let corrected = |e: f64| Correction { grid, values_mm: vec![e; 9], cycle: 1, level_mm: 0.01, set: None };
+        let corrected = |e: f64| Correction { grid, values_mm: vec![e; 9], cycle: 1, level_mm: 0.01, parameters: None };
         let [before, after] = [0.0, 0.004].map(|e| TargetSurface::new(slope.clone(), &corrected(e), 5.0).unwrap());
         for wheel in
             [Wheel::Sphere { radius_mm: 5.0 }, Wheel::Torus { ring_mm: 8.0, tube_mm: 2.0, spindle: Vector::y() }]
@@ -123,7 +123,8 @@ mod tests {
             let slopes: Vec<[f64; 2]> =
                 (0..on.columns * on.rows).map(|k| [if ground(k) > 0.0 { facing } else { 0.0 }, 0.0]).collect();
             let grid = Grid { columns: 2, rows: 1, first_mm: [first_mm, 0.0], spacing_mm: [40.0, 1.0] };
-            let corrected = |e: f64| Correction { grid, values_mm: vec![e; 2], cycle: 1, level_mm: 0.0, set: None };
+            let corrected =
+                |e: f64| Correction { grid, values_mm: vec![e; 2], cycle: 1, level_mm: 0.0, parameters: None };
             let [before, after] = [0.0, 0.004]
                 .map(|e| TargetSurface::new(HeightField::hermite(on, &heights, &slopes), &corrected(e), 1.0).unwrap());
             axis_offsets(&before, &after, &wheel, &grid)

@@ -251,7 +251,7 @@ mod tests {
     fn correction(value: impl Fn(f64, f64) -> f64) -> Correction {
         let grid = Grid { columns: 17, rows: 17, first_mm: [-8.0, -8.0], spacing_mm: [1.0, 1.0] };
         let values_mm = (0..grid.len()).map(|k| grid.place_mm(k)).map(|[x, y]| value(x, y)).collect();
-        Correction { grid, values_mm, cycle: 2, level_mm: 0.02, set: None }
+        Correction { grid, values_mm, cycle: 2, level_mm: 0.02, parameters: None }
     }
 
     #[test]
@@ -298,7 +298,7 @@ mod tests {
             values_mm: vec![0.007],
             cycle: 1,
             level_mm: 0.0,
-            set: None,
+            parameters: None,
         };
         assert!((correction_spline(&one, 2.0).at([5.0, -9.0]).value - 0.007).abs() < 1e-15);
     }

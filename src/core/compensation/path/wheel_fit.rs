@@ -226,7 +226,7 @@ pub(super) mod tests {
         let places = (0..on.len()).map(|k| on.place_mm(k));
         let (z, slopes): (Vec<f64>, Vec<[f64; 2]>) = places.map(height).unzip();
         let grid = Grid { columns: 2, rows: 2, first_mm: [-8.0, -6.0], spacing_mm: [16.0, 12.0] };
-        let none = Correction { grid, values_mm: vec![0.0; 4], cycle: 1, level_mm: 0.0, set: None };
+        let none = Correction { grid, values_mm: vec![0.0; 4], cycle: 1, level_mm: 0.0, parameters: None };
         TargetSurface::new(HeightField::hermite(on, &z, &slopes), &none, 5.0).unwrap()
     }
 

@@ -142,13 +142,14 @@ fn rotation_from_sampling_is_locked() {
         cloud.iter_mut().flatten().for_each(|v| *v += 3e-4 * normal(&mut rng));
         let options = RegistrationOptions { start: Start::Pose(pose(&placement())), ..free() };
         let found = register(&nominal, &points(&cloud), &options).unwrap();
-        let weak: Vec<&str> = found.quality.weak_directions.iter().map(|weak| weak.words.as_str()).collect();
+        let weak: Vec<&str> = found.quality.weak_directions.iter().map(|weak| weak.description.as_str()).collect();
         assert!(
-            found.quality.weak_directions.iter().any(|weak| weak.held) && weak[0].contains("rotation about z"),
+            found.quality.weak_directions.iter().any(|weak| weak.is_undetermined)
+                && weak[0].contains("rotation about z"),
             "{columns} x {rows}: {weak:?}, condition {:.1e}",
             found.quality.condition
         );
-        let held = found.quality.weak_directions.iter().filter(|weak| weak.held).count();
+        let held = found.quality.weak_directions.iter().filter(|weak| weak.is_undetermined).count();
         assert_eq!(held, 1, "{columns} x {rows}: {weak:?}");
     }
 }

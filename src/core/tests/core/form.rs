@@ -141,7 +141,7 @@ fn pvr_ignores_single_spike() {
             found.pv_998_mm,
             clean.pv_998_mm
         );
-        assert_eq!((found.highest.value_mm, found.highest.at_mm), (1e-2, smooth[middle].place_mm));
+        assert_eq!((found.highest.value_mm, found.highest.place_mm), (1e-2, smooth[middle].place_mm));
         assert_eq!(found.lowest, clean.lowest);
         // PVr by hand: three times the rms of the rest and the range of the fit.
         let rms = found.pvr.residual_rms_mm;

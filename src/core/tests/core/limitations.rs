@@ -333,7 +333,7 @@ fn trace_ends_with_reported_result() {
         let (count, squares) = used.fold((0, 0.0), |(n, sum), d| (n + 1, sum + d.deviation_mm * d.deviation_mm));
         assert_eq!(found.quality.inliers, count, "{name}");
         let last = found.trace.last().expect(name);
-        assert!(last.taken && last.points == count, "{name}: {last:?}");
+        assert!(last.accepted && last.points == count, "{name}: {last:?}");
         assert!((last.objective_mm2 / squares - 1.0).abs() < 1e-6, "{name}: {last:?} {squares}");
         assert!((found.quality.objective_mm2 / squares - 1.0).abs() < 1e-6, "{name}");
     }

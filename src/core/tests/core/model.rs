@@ -451,7 +451,7 @@ fn covered_area_figures(part: &Part) -> [bool; 9] {
         contains(told.rms_irregularity, iso.rms_irregularity_mm),
         contains(told.rms_varying, iso.rms_varying_mm),
         contains_angle(slope.rms, slopes[0]),
-        contains_angle(slope.largest, slopes[1]),
+        contains_angle(slope.max, slopes[1]),
     ]
 }
 
@@ -474,7 +474,7 @@ fn formless_part_has_upper_bounds_only() {
     ] {
         assert!(of.low_mm == 0.0 && of.high_mm > truth_mm, "{of:?} {truth_mm}");
     }
-    assert!(slope.rms.low_rad == 0.0 && slope.largest.low_rad == 0.0 && slope.rms.high_rad > slopes[0], "{slope:?}");
+    assert!(slope.rms.low_rad == 0.0 && slope.max.low_rad == 0.0 && slope.rms.high_rad > slopes[0], "{slope:?}");
     // The scatter of the probe is off them.
     let raw: Vec<f64> = part.registration.deviations.iter().map(|d| d.deviation_mm).collect();
     let places: Vec<[f64; 2]> = part.registration.deviations.iter().map(|d| [d.point.x, d.point.y]).collect();

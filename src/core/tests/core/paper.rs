@@ -57,7 +57,7 @@ fn register_undoes_large_displacement() {
             assert_eq!(found.quality.inliers, measured.len(), "{case}");
             assert!(found.quality.iterations <= 10, "{case}: {} iterations", found.quality.iterations);
             // Eq. (14), as long as the points are the same: those on the very edge come in when the pose is found.
-            let taken: Vec<_> = found.trace.iter().filter(|turn| turn.taken).collect();
+            let taken: Vec<_> = found.trace.iter().filter(|turn| turn.accepted).collect();
             let falls = |w: &[&regrind_core::registration::Iteration]| {
                 w[1].objective_mm2 <= w[0].objective_mm2 || w[1].points != w[0].points
             };

@@ -43,7 +43,7 @@ fn from_identity(probe_radius_mm: f64) -> RegistrationOptions {
 }
 
 fn weak_direction_words(found: &Registration) -> String {
-    found.quality.weak_directions.iter().map(|w| w.words.as_str()).collect::<Vec<_>>().join("; ")
+    found.quality.weak_directions.iter().map(|w| w.description.as_str()).collect::<Vec<_>>().join("; ")
 }
 
 #[test]
@@ -59,7 +59,7 @@ fn register_off_axis_asphere() {
     let said = weak_direction_words(&found);
     let axis = ["rotation about z", "(-70.0"];
     let is_parent = |words: &str| axis.iter().all(|piece| words.contains(piece));
-    assert!(found.quality.weak_directions.iter().any(|w| w.held && is_parent(&w.words)), "{said}");
+    assert!(found.quality.weak_directions.iter().any(|w| w.is_undetermined && is_parent(&w.description)), "{said}");
     assert!((found.quality.rms_mm / 3e-4 - 1.0).abs() < 0.05, "{}", found.quality.rms_mm);
 }
 
@@ -93,8 +93,8 @@ fn shallow_wave_reports_weak_directions() {
     assert!(error < 1e-4, "{error}");
     let said = weak_direction_words(&found);
     let weak = &found.quality.weak_directions;
-    assert!(weak.iter().any(|w| w.words.contains("x and y position") && w.sigma_mm.is_some()), "{said}");
-    assert!(weak.iter().all(|w| !w.held), "{said}");
+    assert!(weak.iter().any(|w| w.description.contains("x and y position") && w.sigma_mm.is_some()), "{said}");
+    assert!(weak.iter().all(|w| !w.is_undetermined), "{said}");
     // What is said of the weak directions is true of them.
     let off = (pose(&placement).inverse() * found.cmm_from_model).log();
     for k in [0, 1] {
@@ -111,7 +111,7 @@ fn sphere_cap_locks_rotations() {
     let found = register(&nominal, &measured(&shape, [22.0, 22.0], [40, 40], &placement, 3e-4), &options).unwrap();
     let said = weak_direction_words(&found);
     assert!(said.contains("every rotation about (") && said.contains("-60.0"), "{said}");
-    assert!(found.quality.weak_directions[0].held);
+    assert!(found.quality.weak_directions[0].is_undetermined);
     // The centre is where it should be, to the scatter of 1,600 points; no rotation was made up.
     let centre = Point::new(0.0, 0.0, -60.0);
     assert!((found.cmm_from_model.transform_point(&centre) - pose(&placement).transform_point(&centre)).norm() < 1e-3);

@@ -197,9 +197,12 @@ fn stopping_risk_of_repeated_tests() {
     let rms = part.decide(&first, &last, &LOOSE).form.figures.rms;
     let between = |rms_mm| StoppingCriteria { rms_mm, correction_sigma_mm: 0.1, ..LOOSE };
     // Within with 97.5 %, by which a run judges, and not with 99.5 %, by which it looks.
-    assert_eq!(part.decide(&first, &last, &between(0.5 * (rms.high_mm + rms.most_mm))).reason, Reason::Undecided);
+    assert_eq!(
+        part.decide(&first, &last, &between(0.5 * (rms.high_mm + rms.decision_high_mm))).reason,
+        Reason::Undecided
+    );
     assert_eq!(part.decide(&first, &last, &between(0.5 * (rms.median_mm + rms.high_mm))).reason, Reason::FormKnown);
-    assert_eq!(part.decide(&first, &last, &between(1.001 * rms.most_mm)).reason, Reason::WithinLimits);
+    assert_eq!(part.decide(&first, &last, &between(1.001 * rms.decision_high_mm)).reason, Reason::WithinLimits);
 }
 
 #[test]
