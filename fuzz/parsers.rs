@@ -240,7 +240,7 @@ pub fn program(bytes: &[u8]) -> bool {
         // The two interpreters agree on whatever is not refused.
         assert!(!amended.as_ref().is_err_and(|error| error.to_string().contains("report it with")), "{amended:?}");
         if let Ok(amended) = amended {
-            assert!(amended.largest_mm.is_finite());
+            assert!(amended.max_shift_mm.is_finite());
             let text = fs::read_to_string(&out).expect("the program that was written");
             let words = text.lines().filter(|line| !line.contains(['(', ';']));
             assert!(words.into_iter().all(|line| !line.contains("NaN") && !line.contains("inf")));

@@ -178,12 +178,12 @@ fn digits<S: Serializer>(identity: &[u8; 32], to: S) -> Result<S::Ok, S::Error> 
 impl EventLog {
     const CAPACITY: usize = 1 << 16;
 
-    pub(crate) fn push(&mut self, at: Duration, what: HandshakeEvent) {
+    pub(crate) fn push(&mut self, at: Duration, event: HandshakeEvent) {
         if self.entries.len() == Self::CAPACITY {
             self.entries.drain(..Self::CAPACITY / 2);
             self.forgotten += Self::CAPACITY as u64 / 2;
         }
-        let seen = LogEntry { time: at, event: what };
+        let seen = LogEntry { time: at, event };
         if let Some(observer) = &mut self.observer {
             observer(&seen);
         }

@@ -411,11 +411,11 @@ impl Alarm {
     /// general description alone.
     pub(super) fn new(id: AlarmId, case: impl AsRef<str>) -> Self {
         let (head, consequence, clears, remedy) = id.entry();
-        let what = match case.as_ref() {
+        let event = match case.as_ref() {
             "" => format!("{head}."),
             case => format!("{head}: {case}."),
         };
         let remedy = remedy.iter().map(|line| (*line).to_owned()).collect();
-        Self { id, event: what, consequence: consequence.to_owned(), remedy, cleared_by: clears }
+        Self { id, event, consequence: consequence.to_owned(), remedy, cleared_by: clears }
     }
 }

@@ -21,7 +21,8 @@ pub struct Actor {
 /// `device` is the machine that the event comes from or is about. `boot_id` identifies this start of its application.
 /// `cycle` is in every event that belongs to a cycle; the cell refuses an event of another cycle. `actor` is the person
 /// who gave the order, looked at the machine, or started the program. `reason`, which can be empty, and `evidence` are
-/// this person's words. `why` and `message` describe the observation, with the value and the limit.
+/// this person's words. In an event from a machine or a computation, `reason` and `message` describe the observation,
+/// with the value and the limit.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[expect(missing_docs, reason = "the fields are told above")]
 #[serde(tag = "event", rename_all = "snake_case")]
@@ -563,20 +564,20 @@ impl RecordedParameter {
         let Self {
             name,
             unit,
-            estimate: off,
+            estimate,
             expanded_uncertainty: expanded,
-            compensated: taken,
-            total_correction: told,
+            compensated,
+            total_correction,
             rms_reduction_um: removes_rms_um,
         } = self;
-        let found = format!("{name}: error {off:.2} \u{b1} {expanded:.2} {unit}");
-        if *taken == 0.0 && *told == 0.0 {
+        let found = format!("{name}: error {estimate:.2} \u{b1} {expanded:.2} {unit}");
+        if *compensated == 0.0 && *total_correction == 0.0 {
             return format!(
                 "{found}; this error is not significant, so this parameter is not corrected; the map corrects the whole error"
             );
         }
         format!(
-            "{found}; the next pass compensates {taken:.2} {unit} of this error (total correction of the parameter, in the same unit: {told:.2}); this lowers the RMS by {removes_rms_um:.2} \u{b5}m"
+            "{found}; the next pass compensates {compensated:.2} {unit} of this error (total correction of the parameter, in the same unit: {total_correction:.2}); this lowers the RMS by {removes_rms_um:.2} \u{b5}m"
         )
     }
 }

@@ -24,10 +24,10 @@ impl Cell {
     ///
     /// If the present state does not accept the event, the last command is [`Command::Refuse`] with the reason.
     pub fn handle(&mut self, now: Duration, event: Event) -> Vec<Command> {
-        if let Err(why) = self.apply_event(now, &event) {
+        if let Err(reason) = self.apply_event(now, &event) {
             let (event, state) = (Box::new(event), self.state);
-            let why = why.unwrap_or_else(|| format!("{} is not accepted in the state {state}", event.in_words()));
-            self.commands.push(Command::Refuse { event, state, reason: why });
+            let reason = reason.unwrap_or_else(|| format!("{} is not accepted in the state {state}", event.in_words()));
+            self.commands.push(Command::Refuse { event, state, reason });
         }
         std::mem::take(&mut self.commands)
     }
@@ -145,22 +145,22 @@ impl Cell {
             (_, Event::Restarted { actor }) => self.on_restarted(&actor.to_string()),
 
             // Failures of the record, and conditions outside.
-            (_, Event::RecordFailed { reason: why }) => self.on_record_failed(why),
-            (Execute(phase), Event::LinkLost { device, reason: why }) => self.on_link_lost(phase, *device, why, Suspended),
+            (_, Event::RecordFailed { reason }) => self.on_record_failed(reason),
+            (Execute(phase), Event::LinkLost { device, reason }) => self.on_link_lost(phase, *device, reason, Suspended),
             (
                 Unholding(phase) | Unsuspending(phase) | Suspending(phase) | Suspended(phase),
-                Event::LinkLost { device, reason: why },
+                Event::LinkLost { device, reason },
             ) => {
-                self.on_link_lost(phase, *device, why, Suspended);
+                self.on_link_lost(phase, *device, reason, Suspended);
             }
-            (Holding(phase) | Held(phase), Event::LinkLost { device, reason: why }) => {
-                self.on_link_lost(phase, *device, why, Held)
+            (Holding(phase) | Held(phase), Event::LinkLost { device, reason }) => {
+                self.on_link_lost(phase, *device, reason, Held)
             }
-            (_, Event::LinkLost { device, reason: why }) => {
+            (_, Event::LinkLost { device, reason }) => {
                 self.set_link_lost(*device, true);
-                self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
+                self.raise(AlarmId::LinkLost, &format!("{device}, {reason}"));
             }
-            (_, Event::StationFailed { device, reason: why }) => self.on_station_failed(*device, why),
+            (_, Event::StationFailed { device, reason }) => self.on_station_failed(*device, reason),
             (_, Event::LinkBack { device, boot_id }) => self.on_link_back(*device, *boot_id),
             (Execute(phase), Event::ConditionLost { device, condition, message }) => {
                 self.on_condition_lost(*device, *condition, message);
@@ -183,21 +183,21 @@ impl Cell {
             // The result stays at the machine, which gets the acknowledgement in the next run.
             (Stopping, Event::NotOnRecord { command }) if command.starts_with("acknowledge") => self.finish_stopped(),
             (_, Event::NotOnRecord { .. }) => {}
-            (_, Event::ControlLost { reason: why }) => self.raise(AlarmId::ControlLost, why),
+            (_, Event::ControlLost { reason }) => self.raise(AlarmId::ControlLost, reason),
             (_, Event::ControlBack) => self.withdraw(AlarmId::ControlLost),
 
             (_, Event::NotAutomatic { device, message }) => self.on_manual_mode(*device, message),
             (_, Event::AutomaticAgain { device }) => self.on_automatic_mode(*device),
 
             // Connecting.
-            (Starting, Event::Connected { device, boot_id, occupation: found, .. }) => self.on_connected(*device, *boot_id, found),
-            (Held(phase) | Holding(phase), Event::Connected { device, boot_id, occupation: found, .. }) => {
-                self.on_reconnected(phase, *device, *boot_id, found);
+            (Starting, Event::Connected { device, boot_id, occupation, .. }) => self.on_connected(*device, *boot_id, occupation),
+            (Held(phase) | Holding(phase), Event::Connected { device, boot_id, occupation, .. }) => {
+                self.on_reconnected(phase, *device, *boot_id, occupation);
             }
-            (Starting | Held(_) | Holding(_), Event::NotConnected { device, reason: why }) => self.on_not_connected(*device, why),
-            (Starting, Event::Refused { device, request: MachineRequest::Clear, reason: why }) => {
-                self.raise(AlarmId::NotIdle, &format!("{device}, {why}"));
-                self.stop(&format!("the {device} did not clear its old job or fault: {why}"), false);
+            (Starting | Held(_) | Holding(_), Event::NotConnected { device, reason }) => self.on_not_connected(*device, reason),
+            (Starting, Event::Refused { device, request: MachineRequest::Clear, reason }) => {
+                self.raise(AlarmId::NotIdle, &format!("{device}, {reason}"));
+                self.stop(&format!("the {device} did not clear its old job or fault: {reason}"), false);
             }
 
             // Job of a machine, in its steps. `advance` continues, or stays at the border of the phase if the cell is
@@ -239,8 +239,8 @@ impl Cell {
             {
                 self.reconcile(*device);
             }
-            (state, Event::JobVanished { device, reason: why }) if state.phase() == Some(Phase::from_job(*device, JobStep::Run)) => {
-                self.on_job_vanished(*device, why);
+            (state, Event::JobVanished { device, reason }) if state.phase() == Some(Phase::from_job(*device, JobStep::Run)) => {
+                self.on_job_vanished(*device, reason);
             }
             // The cell already asks the machine, or knows the end of the job.
             (_, Event::JobVanished { .. }) => {}
@@ -264,11 +264,11 @@ impl Cell {
             (state, Event::Ended { device, result, .. }) if running_device(state) == Some(*device) => {
                 self.on_ended(*device, *result)
             }
-            (state, Event::RecordDoubted { reason: why, .. }) if running_device(state) == Some(Device::Grinder) => {
+            (state, Event::RecordDoubted { reason, .. }) if running_device(state) == Some(Device::Grinder) => {
                 self.pass_record_doubted = true;
-                self.raise(AlarmId::PassRecord, why);
+                self.raise(AlarmId::PassRecord, reason);
             }
-            (Stopping, Event::RecordDoubted { reason: why, .. }) => self.raise(AlarmId::PassRecord, why),
+            (Stopping, Event::RecordDoubted { reason, .. }) => self.raise(AlarmId::PassRecord, reason),
             (state, Event::Reconciled { device, outcome, .. }) if reconciling_device(state) == Some(*device) => {
                 self.on_reconciled(*device, outcome);
             }
@@ -284,25 +284,25 @@ impl Cell {
                 self.on_acknowledged(p);
             }
             (Stopping, Event::Acknowledged { .. }) => self.finish_stopped(),
-            (Execute(p) | Holding(p), Event::Refused { device, request: what, reason: why }) if awaits_answer(p, *device, *what) => {
-                self.on_refused(p, *device, *what, why);
+            (Execute(p) | Holding(p), Event::Refused { device, request, reason }) if awaits_answer(p, *device, *request) => {
+                self.on_refused(p, *device, *request, reason);
             }
             (
                 Holding(_) | Suspending(_) | Held(_) | Suspended(_),
-                Event::Refused { device, request: MachineRequest::Hold, reason: why },
+                Event::Refused { device, request: MachineRequest::Hold, reason },
             ) => {
-                self.raise(AlarmId::HoldNotConfirmed, &format!("{device}, {why}"));
-                self.abort(&format!("the {device} refused to hold: {why}"));
+                self.raise(AlarmId::HoldNotConfirmed, &format!("{device}, {reason}"));
+                self.abort(&format!("the {device} refused to hold: {reason}"));
             }
-            (Unholding(p) | Unsuspending(p), Event::Refused { device, request: MachineRequest::Resume, reason: why })
+            (Unholding(p) | Unsuspending(p), Event::Refused { device, request: MachineRequest::Resume, reason })
                 if p.moving_device() == Some(*device) =>
             {
-                self.raise(AlarmId::MachineRefused, &format!("{device}, resume: {why}"));
+                self.raise(AlarmId::MachineRefused, &format!("{device}, resume: {reason}"));
                 self.enter_state(Held(p));
             }
-            (Stopping, Event::Refused { device, request: MachineRequest::Stop | MachineRequest::Acknowledge | MachineRequest::Discard, reason: why }) => {
-                self.raise(AlarmId::StopNotConfirmed, &format!("{device}, {why}"));
-                self.abort(&format!("the {device} refused to stop: {why}"));
+            (Stopping, Event::Refused { device, request: MachineRequest::Stop | MachineRequest::Acknowledge | MachineRequest::Discard, reason }) => {
+                self.raise(AlarmId::StopNotConfirmed, &format!("{device}, {reason}"));
+                self.abort(&format!("the {device} refused to stop: {reason}"));
             }
             (Execute(p), Event::Obstructed { device, message }) if p.moving_device() == Some(device.other()) => {
                 self.machine_mut(*device).clear = false;
@@ -317,15 +317,15 @@ impl Cell {
 
             // Computations.
             (Execute(Register) | Holding(Register), Event::Registered { figures, .. }) => self.on_registered(figures),
-            (Execute(Register) | Holding(Register), Event::RegistrationFailed { reason: why, .. }) => {
-                self.reject_measurement(AlarmId::RegistrationFailed, why);
+            (Execute(Register) | Holding(Register), Event::RegistrationFailed { reason, .. }) => {
+                self.reject_measurement(AlarmId::RegistrationFailed, reason);
             }
             (
                 Execute(p @ (Register | Compensate | Measure(JobStep::Collect)))
                 | Holding(p @ (Register | Compensate | Measure(JobStep::Collect))),
-                Event::NotSaved { reason: why, .. },
+                Event::NotSaved { reason, .. },
             ) => {
-                self.raise_record_failed(why);
+                self.raise_record_failed(reason);
                 self.enter_state(Held(p));
             }
             (Execute(Compensate) | Holding(Compensate), Event::Compensated { summary, .. }) => {
@@ -337,7 +337,7 @@ impl Cell {
                     self.enter_state(Held(Grind(JobStep::Send)));
                 }
             }
-            (Execute(Compensate) | Holding(Compensate), Event::CompensationRefused { reason: why, .. }) => self.on_compensation_refused(why),
+            (Execute(Compensate) | Holding(Compensate), Event::CompensationRefused { reason, .. }) => self.on_compensation_refused(reason),
 
             // The end, and time.
             (Completing, Event::Cleared { device }) => self.on_final_clearance(*device, true, ""),

@@ -239,8 +239,8 @@ fn machine_events(device: Device, cycle: u32) -> Vec<Event> {
     }
     events.push(Event::NotAutomatic { device, message: text() });
     events.push(Event::AutomaticAgain { device });
-    for found in [Occupation::Idle, Occupation::ToClear, Occupation::Busy(text())] {
-        events.push(Event::Connected { device, boot_id: 1, simulated: true, occupation: found });
+    for occupation in [Occupation::Idle, Occupation::ToClear, Occupation::Busy(text())] {
+        events.push(Event::Connected { device, boot_id: 1, simulated: true, occupation });
     }
     let unlike = [
         ConnectionRefusal::Unreachable(text()),
@@ -248,8 +248,8 @@ fn machine_events(device: Device, cycle: u32) -> Vec<Event> {
         ConnectionRefusal::WordOrder(text()),
     ];
     let more = [ConnectionRefusal::Inches, ConnectionRefusal::Owned(text()), ConnectionRefusal::AtAnotherJob(text())];
-    for why in unlike.into_iter().chain(more) {
-        events.push(Event::NotConnected { device, reason: why });
+    for reason in unlike.into_iter().chain(more) {
+        events.push(Event::NotConnected { device, reason });
     }
     for result in [JobResult::Complete, JobResult::Stopped, JobResult::Aborted, JobResult::Failed] {
         events.push(Event::Ended { device, cycle, result });
@@ -260,8 +260,8 @@ fn machine_events(device: Device, cycle: u32) -> Vec<Event> {
         events.push(Event::Reconciled { device, cycle, outcome });
     }
     use MachineRequest::{Abort, Acknowledge, Clear, Collect, Discard, Hold, Load, Prepare, Resume, Start, Stop};
-    for what in [Load, Prepare, Start, Hold, Resume, Stop, Abort, Clear, Collect, Acknowledge, Discard] {
-        events.push(Event::Refused { device, request: what, reason: text() });
+    for request in [Load, Prepare, Start, Hold, Resume, Stop, Abort, Clear, Collect, Acknowledge, Discard] {
+        events.push(Event::Refused { device, request, reason: text() });
     }
     events
 }
@@ -298,8 +298,8 @@ fn computation_events(cycle: u32) -> Vec<Event> {
     let asking = CompensationSummary { confirmations_required: vec![text()], ..summary };
     events.push(Event::Compensated { cycle, summary: asking });
     let refusals = [CompensationRefusal::BudgetSpent(text()), CompensationRefusal::WeakDirections(Vec::new())];
-    for why in refusals.into_iter().chain([CompensationRefusal::Failed(text())]) {
-        events.push(Event::CompensationRefused { cycle, reason: why });
+    for reason in refusals.into_iter().chain([CompensationRefusal::Failed(text())]) {
+        events.push(Event::CompensationRefused { cycle, reason });
     }
     events
 }

@@ -146,8 +146,8 @@ pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<
         // The resume applies to the current state of the cell. If another terminal gives a hold in the meantime, that
         // hold stays.
         Request::Resume { reason, state_number: None } => {
-            let seen = Some(asked(&Request::Status)?.status.state_number);
-            asked(&Request::Resume { reason: reason.clone(), state_number: seen })?
+            let state_number = Some(asked(&Request::Status)?.status.state_number);
+            asked(&Request::Resume { reason: reason.clone(), state_number })?
         }
         request => asked(request)?,
     };
@@ -211,8 +211,8 @@ fn status_text(status: &Snapshot, folder: &Path) -> String {
         cycle => format!("cycle {cycle} of at most {}", status.max_cycles),
     };
     let _ = writeln!(text, "{marked}{}, {cycle}", status.message);
-    if let Some(JobProgress { device, done, total, remaining_s: left_s }) = status.progress {
-        let left = left_s.map_or(String::new(), |left_s| format!(", {} left", time_left(left_s)));
+    if let Some(JobProgress { device, done, total, remaining_s }) = status.progress {
+        let left = remaining_s.map_or(String::new(), |remaining_s| format!(", {} left", time_left(remaining_s)));
         let _ = writeln!(text, "{}{left}", how_far(device, done, total));
     }
     if let Some(told) = &status.preview {

@@ -73,8 +73,8 @@ enum FindingLevel {
 }
 
 impl Finding {
-    fn new(what: impl Into<String>, found: FindingLevel, words: impl Into<String>) -> Self {
-        Self { check: what.into(), level: found, message: words.into() }
+    fn new(check: impl Into<String>, level: FindingLevel, words: impl Into<String>) -> Self {
+        Self { check: check.into(), level, message: words.into() }
     }
 
     fn from_result<E: std::fmt::Display>(what: &str, looked: Result<String, E>) -> Self {
@@ -105,13 +105,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 }
 
 fn in_words(finding: &Finding) -> String {
-    let Finding { check: what, level: found, message: words } = finding;
-    let mark = match found {
+    let Finding { check, level, message: words } = finding;
+    let mark = match level {
         FindingLevel::Good => "ok",
         FindingLevel::Notice => "note",
         FindingLevel::Obstacle => "OBSTACLE",
     };
-    format!("{mark:<9}{what}: {words}\n")
+    format!("{mark:<9}{check}: {words}\n")
 }
 
 /// Checks the folder `runs`, in which the runs are stored, and returns the result. The result is an obstacle if no file

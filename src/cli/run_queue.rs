@@ -33,7 +33,7 @@ Examples:
   regrind work --plant cell-1.toml --cell config/modbus-tcp.toml --operator \"A. Smith\"
   regrind work --plant cell-1.toml --part SN-0042 --once
   regrind work --plant cell-1.toml --give-back SN-0042
-  regrind work --plant cell-1.toml --give-up SN-0042 --why \"the blank broke\"
+  regrind work --plant cell-1.toml --give-up SN-0042 --reason \"the blank broke\"
 
 Exit codes: 0 all queued parts are accepted; 1 a part was not accepted, was returned to the queue, or was started
 here and is not finished;
@@ -64,10 +64,10 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "SERIAL", value_parser = super::name, conflicts_with_all = ["part", "once", "wait"])]
     give_back: Option<String>,
     /// Give up a part whose run was interrupted and will not be resumed: a planner decides whether it is made again
-    #[arg(long, value_name = "SERIAL", value_parser = super::name, requires = "why", conflicts_with_all = ["part", "once", "wait", "give_back"])]
+    #[arg(long, value_name = "SERIAL", value_parser = super::name, requires = "reason", conflicts_with_all = ["part", "once", "wait", "give_back"])]
     give_up: Option<String>,
     /// Reason for giving it up, for the record
-    #[arg(long, value_name = "WORDS", value_parser = super::name, requires = "give_up")]
+    #[arg(long, alias = "why", value_name = "WORDS", value_parser = super::name, requires = "give_up")]
     reason: Option<String>,
     /// Seed of other simulated parts and runs
     #[arg(long, value_name = "N")]
@@ -241,7 +241,7 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
             RunProgress::Over => continue,
             RunProgress::UnderWay => {
                 let why = format!(
-                    "run {run} of {serial} is not over: regrind resume {} continues the run; if resume is refused, give up the part: regrind work --give-up {serial} --why \"...\"",
+                    "run {run} of {serial} is not over: regrind resume {} continues the run; if resume is refused, give up the part: regrind work --give-up {serial} --reason \"...\"",
                     folder.display()
                 );
                 return Err(Failure::OpenWork { why });

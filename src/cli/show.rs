@@ -92,8 +92,8 @@ impl Show {
 
     fn show(&mut self, notice: &Notice) -> Result<(), Failure> {
         match notice {
-            Notice::Progress { device, cycle, done, total, remaining_s: left_s } => {
-                self.progress((*device, *cycle), *done, *total, *left_s)
+            Notice::Progress { device, cycle, done, total, remaining_s } => {
+                self.progress((*device, *cycle), *done, *total, *remaining_s)
             }
             Notice::State { state, cycle, event, has_progress: at_job } => {
                 if let Some(bar) = &self.bar {
@@ -153,7 +153,7 @@ impl Show {
                 self.alarms.remove(alarm);
                 Ok(())
             }
-            Notice::Refused { reason: why } => self.line(&format!("refused: {why}")),
+            Notice::Refused { reason } => self.line(&format!("refused: {reason}")),
             Notice::RecordFailed { message } => self.line(&format!("RECORD: {message}")),
             Notice::Finished { ending, cycles, touches } => self.finished(ending, cycles, *touches),
         }
@@ -194,13 +194,13 @@ impl Show {
         let compared = self.tolerance.compare(figures);
         let [pv, rms] = compared.map(|compared| judged(&compared));
         let (points, outliers) = (figures.points, figures.outliers);
-        if let Some(FurtherTouches { target_count: targets, reason: why }) = figures.further_touches.as_deref() {
+        if let Some(FurtherTouches { target_count: targets, reason }) = figures.further_touches.as_deref() {
             // The first touches only show that they belong to this part.
             let known = figures
                 .form
                 .filter(|_| points as usize > FIRST_BATCH)
                 .map_or(String::new(), |_| format!("{pv}; {rms}; "));
-            self.line(&format!("cycle {cycle}: {known}{points} points measured; {targets} more follow: {why}"))?;
+            self.line(&format!("cycle {cycle}: {known}{points} points measured; {targets} more follow: {reason}"))?;
             return self.picture(cycle);
         }
         let mut text = format!("cycle {cycle}: {pv}; {rms}; {points} points, {outliers} outliers");
@@ -352,10 +352,10 @@ pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
 /// Returns a line of text about a measurement that is not yet complete. The line states the number of touches on the
 /// part, and the RMS, minimum and maximum of the deviations from the planned positions in µm.
 pub(super) fn preview_text(
-    PreviewStatistics { touch_count: touched, rms_um, min_um: least_um, max_um: most_um }: &PreviewStatistics,
+    PreviewStatistics { touch_count: touched, rms_um, min_um, max_um }: &PreviewStatistics,
 ) -> String {
     format!(
-        "preliminary, relative to the planned position: {touched} points touched, RMS {rms_um:.2} µm, deviations from {least_um:+.2} to {most_um:+.2} µm"
+        "preliminary, relative to the planned position: {touched} points touched, RMS {rms_um:.2} µm, deviations from {min_um:+.2} to {max_um:+.2} µm"
     )
 }
 

@@ -170,13 +170,15 @@ pub(super) fn prove(runs: &Path, keys: &[PublicKey], json: bool) -> Result<Outco
         proof.follows((*number, folder), before.as_ref(), last);
         last = Some((*number, folder));
     }
-    let Proof { records: told, flaws, are_under_way } = &proof;
+    let Proof { records, flaws, are_under_way } = &proof;
     if json {
-        super::print_json(&json!({ "runs": runs, "sound": flaws.is_empty(), "flaws": flaws, "each": told }))?;
+        super::print_json(&json!({ "runs": runs, "sound": flaws.is_empty(), "flaws": flaws, "each": records }))?;
     } else {
-        let lines =
-            told.iter().map(|told| format!("{}\n", told["words"].as_str().unwrap_or_default())).collect::<String>();
-        super::print(&format!("{lines}{} runs, {} flaws\n", told.len(), flaws.len()))?;
+        let lines = records
+            .iter()
+            .map(|records| format!("{}\n", records["words"].as_str().unwrap_or_default()))
+            .collect::<String>();
+        super::print(&format!("{lines}{} runs, {} flaws\n", records.len(), flaws.len()))?;
     }
     match flaws.first() {
         Some(first) => Err(Failure::RunsLack { runs: runs.to_owned(), flaws: flaws.len(), first: first.clone() }),

@@ -228,8 +228,8 @@ impl View {
     }
 
     fn job(&self, frame: &mut Frame, area: Rect) {
-        let Some(JobProgress { device, done, total, remaining_s: left_s }) = self.snapshot.progress else { return };
-        let left = left_s.map_or(String::new(), |left_s| format!(", {} left", time_left(left_s)));
+        let Some(JobProgress { device, done, total, remaining_s }) = self.snapshot.progress else { return };
+        let left = remaining_s.map_or(String::new(), |remaining_s| format!(", {} left", time_left(remaining_s)));
         let ratio = (f64::from(done) / f64::from(total.max(1))).clamp(0.0, 1.0);
         let gauge = Gauge::default()
             .ratio(ratio)

@@ -391,7 +391,7 @@ impl StatusStream {
     /// too many clients already watch.
     pub async fn next(&mut self) -> io::Result<Option<Snapshot>> {
         let Some(text) = tokio::time::timeout(SILENCE_TIMEOUT, self.lines.next_line()).await?? else { return Ok(None) };
-        let Reply { accepted: taken, message, status } = serde_json::from_str(&text)?;
-        if taken { Ok(Some(status)) } else { Err(io::Error::other(message)) }
+        let Reply { accepted, message, status } = serde_json::from_str(&text)?;
+        if accepted { Ok(Some(status)) } else { Err(io::Error::other(message)) }
     }
 }

@@ -253,7 +253,7 @@ enum RecordAction {
 /// Converts a change of the control endpoint (lost or created again) into an event.
 fn control_event(change: EndpointChange) -> Event {
     match change {
-        EndpointChange::Lost(why) => Event::ControlLost { reason: why },
+        EndpointChange::Lost(reason) => Event::ControlLost { reason },
         EndpointChange::Restored => Event::ControlBack,
     }
 }
@@ -430,19 +430,19 @@ impl Drive {
     /// not a known computation.
     async fn handle_panic(&mut self, error: JoinError) {
         let Some((cycle, kind)) = self.running_computations.remove(&error.id()) else { return };
-        let why = format!(
+        let reason = format!(
             "the computation failed because of a fault of the program Regrind; report this fault: {}",
             panic_message(error)
         );
         let event = match kind {
             Computation::Gate => {
-                let gate = GateResult::Failed(GateFailure::Broken(why));
+                let gate = GateResult::Failed(GateFailure::Broken(reason));
                 Event::Collected { cycle, targets: 0, found: 0, gate }
             }
-            Computation::Registration | Computation::FinalRegistration => {
-                Event::RegistrationFailed { cycle, reason: why }
+            Computation::Registration | Computation::FinalRegistration => Event::RegistrationFailed { cycle, reason },
+            Computation::Compensation => {
+                Event::CompensationRefused { cycle, reason: CompensationRefusal::Failed(reason) }
             }
-            Computation::Compensation => Event::CompensationRefused { cycle, reason: CompensationRefusal::Failed(why) },
         };
         self.handle_event(event, None).await;
     }
@@ -491,8 +491,8 @@ impl Drive {
     /// or the cell changed its state before the record was written. Does nothing for other commands.
     async fn report_start_not_sent(&mut self, command: Command) {
         if let Command::StartMachine { device, .. } = command {
-            let why = "START was not sent, because START could not be recorded, or because the cell was held before START was recorded".to_owned();
-            self.handle_event(Event::Refused { device, request: MachineRequest::Start, reason: why }, None).await;
+            let reason = "START was not sent, because START could not be recorded, or because the cell was held before START was recorded".to_owned();
+            self.handle_event(Event::Refused { device, request: MachineRequest::Start, reason }, None).await;
         }
     }
 
@@ -513,13 +513,13 @@ impl Drive {
 
     /// Reports the failure `why` to write a record. Notifies people and the cell only of the first failure in a row.
     /// Then answers all orders that wait for their record.
-    async fn report_record_failure(&mut self, why: RecordFailure) {
-        let message = failure_message(&why);
+    async fn report_record_failure(&mut self, reason: RecordFailure) {
+        let message = failure_message(&reason);
         let is_known = self.record_failure_reason.replace(message.clone()).is_some();
         // The consequences of a failure fail too, including the record of the failure itself. They bring nothing new.
         if !is_known {
             self.notify(Notice::RecordFailed { message });
-            self.handle_event(Event::RecordFailed { reason: why }, None).await;
+            self.handle_event(Event::RecordFailed { reason }, None).await;
         }
         self.answer_unrecorded_orders();
     }
@@ -761,8 +761,8 @@ impl Drive {
         if let Some(FetchedResult::Record(record)) = &fetched {
             let payload = json!({ "pass_record": pass_record::pass_record_document(record) });
             self.record_note(RecordKind::Note, ("grinder".into(), "wire".into()), payload);
-            if let Some(why) = self.pass_record_flaw(record) {
-                self.handle_event(Event::RecordDoubted { cycle: self.cell.cycle(), reason: why }, None).await;
+            if let Some(reason) = self.pass_record_flaw(record) {
+                self.handle_event(Event::RecordDoubted { cycle: self.cell.cycle(), reason }, None).await;
             }
         }
         if let Some(FetchedResult::Points(measurement, taken)) = fetched {
@@ -821,19 +821,19 @@ impl Drive {
         if matches!(&event, Some(Event::Registered { figures, .. }) if figures.further_touches.is_none()) {
             *self.attempts.entry((number, Computation::FinalRegistration)).or_insert(0) += 1;
         }
-        if let (Err(why), Some(Event::Collected { .. } | Event::Registered { .. } | Event::Compensated { .. })) =
+        if let (Err(reason), Some(Event::Collected { .. } | Event::Registered { .. } | Event::Compensated { .. })) =
             (&files, &event)
         {
             // A result that is not recorded is not used. It is computed again after a person has repaired the disk.
-            let event = Event::NotSaved { cycle: number, reason: why.clone() };
-            self.notify(Notice::RecordFailed { message: failure_message(why) });
+            let event = Event::NotSaved { cycle: number, reason: reason.clone() };
+            self.notify(Notice::RecordFailed { message: failure_message(reason) });
             self.handle_event(event, None).await;
             return;
         }
         self.cycles.store(number, product);
         self.record_files(number, files).await;
-        if let Some(Event::RecordFailed { reason: why }) = &event {
-            self.notify(Notice::RecordFailed { message: failure_message(why) });
+        if let Some(Event::RecordFailed { reason }) = &event {
+            self.notify(Notice::RecordFailed { message: failure_message(reason) });
         }
         if let Some(event) = event {
             self.handle_event(event, None).await;
@@ -870,7 +870,7 @@ impl Drive {
             self.execute(command.clone()).await;
         }
         let refusal = commands.iter().find_map(|command| match command {
-            Command::Refuse { reason: why, .. } => Some(why.clone()),
+            Command::Refuse { reason, .. } => Some(reason.clone()),
             _ => None,
         });
         // A refused order changed nothing: only the refusal is shown.
@@ -1000,9 +1000,7 @@ impl Drive {
             Command::Announce(judgement) => self.announce(judgement).await,
             Command::Raise(alarm) => self.notify(Notice::Alarm(alarm)),
             Command::Withdraw { alarm } => self.notify(Notice::AlarmGone { alarm }),
-            Command::Refuse { event, reason: why, .. } if event.is_order() => {
-                self.notify(Notice::Refused { reason: why })
-            }
+            Command::Refuse { event, reason, .. } if event.is_order() => self.notify(Notice::Refused { reason }),
             // A late fact from a machine is recorded, but a person has nothing to do.
             Command::Refuse { .. } => {}
             Command::Finish(ending) => self.ending = Some(ending),
@@ -1078,7 +1076,7 @@ impl Drive {
         let (folder, needed) = (self.folder.clone(), self.task.cycle_bytes().max(2 * self.max_cycle_bytes));
         self.executor.spawn_computation(&mut self.computations, move || {
             let short = require_free_space(&folder, needed).err();
-            let event = short.map(|why| Event::RecordFailed { reason: why });
+            let event = short.map(|reason| Event::RecordFailed { reason });
             ComputationResult { cycle, event, product: ComputationProduct::Nothing, files: Ok(Vec::new()) }
         });
     }
@@ -1195,8 +1193,8 @@ impl Drive {
                 let cycle = self.cell.cycle();
                 self.progress_estimator.record_progress(now, (*device, cycle), *done, *total);
                 self.progress_estimator.update_state(self.cell.state());
-                let left_s = self.progress_estimator.progress().and_then(|progress| progress.remaining_s);
-                Notice::Progress { device: *device, cycle, done: *done, total: *total, remaining_s: left_s }
+                let remaining_s = self.progress_estimator.progress().and_then(|progress| progress.remaining_s);
+                Notice::Progress { device: *device, cycle, done: *done, total: *total, remaining_s }
             }
             Event::Registered { cycle, figures } => {
                 self.notify(Notice::Figures { cycle: *cycle, figures: figures.clone() });

@@ -54,7 +54,7 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
         }
         (C::Acknowledge { device }, E::Refused { device: d, request: MachineRequest::Discard, .. }) => device == d,
         (command, E::NotOnRecord { command: name }) => command.name() == *name,
-        (command, E::Refused { device, request: what, .. }) => machine_request(command) == Some((*device, *what)),
+        (command, E::Refused { device, request, .. }) => machine_request(command) == Some((*device, *request)),
         _ => false,
     }
 }
@@ -91,7 +91,7 @@ mod tests {
         assert!(!by(Event::Started { device: Device::Grinder, cycle: 1 }));
         assert!(!by(Event::Started { device: Device::Cmm, cycle: 2 }));
         assert!(!by(Event::StartUnknown { device: Device::Grinder, cycle: 2, reason: String::new() }));
-        let refused = |what| Event::Refused { device: Device::Grinder, request: what, reason: String::new() };
+        let refused = |request| Event::Refused { device: Device::Grinder, request, reason: String::new() };
         assert!(by(refused(MachineRequest::Start)) && !by(refused(MachineRequest::Prepare)));
     }
 }

@@ -65,7 +65,7 @@ pub(super) fn gate_cycle(
         None => {
             if let Some((again, points)) = again {
                 merge_repeated_touches(again, points, measurement)
-                    .map_or_else(|why| (0, Err(why)), |(points, found)| (found, Ok(points)))
+                    .map_or_else(|reason| (0, Err(reason)), |(points, found)| (found, Ok(points)))
             } else {
                 let [part, sphere] = touched_points(&plan, planned, measurement);
                 let told = (measurement.coordinates, measurement.temperature_c.filter(|told| told.is_finite()));
@@ -83,15 +83,15 @@ pub(super) fn gate_cycle(
         let made = ResultFolder::prepare(files.folder()).map(ResultFolder::keep);
         let saved = made.and_then(|()| write_measured_points(task, files, &points));
         saved.map(|()| points).map_err(|error| match classify_error(error) {
-            ComputationError::NotSaved(why) => ComputationError::NotSaved(why),
+            ComputationError::NotSaved(reason) => ComputationError::NotSaved(reason),
             ComputationError::Failed(message) => ComputationError::Failed(GateFailure::Broken(message)),
         })
     });
     let (gate, product) = match saved {
         Ok(points) => (GateResult::Passed, ComputationProduct::Points(points)),
         Err(ComputationError::Failed(failure)) => (GateResult::Failed(failure), ComputationProduct::Nothing),
-        Err(ComputationError::NotSaved(why)) => {
-            return (Event::NotSaved { cycle: number, reason: why }, ComputationProduct::Nothing);
+        Err(ComputationError::NotSaved(reason)) => {
+            return (Event::NotSaved { cycle: number, reason }, ComputationProduct::Nothing);
         }
     };
     (Event::Collected { cycle: number, targets: planned.max(found), found, gate }, product)
@@ -425,11 +425,11 @@ pub(super) fn register_cycle(
             let event = Event::Registered { cycle: number, figures: found.figures.clone() };
             (event, ComputationProduct::Registered(Box::new(found)))
         }
-        Err(ComputationError::Failed(why)) => {
-            (Event::RegistrationFailed { cycle: number, reason: why }, ComputationProduct::Nothing)
+        Err(ComputationError::Failed(reason)) => {
+            (Event::RegistrationFailed { cycle: number, reason }, ComputationProduct::Nothing)
         }
-        Err(ComputationError::NotSaved(why)) => {
-            (Event::NotSaved { cycle: number, reason: why }, ComputationProduct::Nothing)
+        Err(ComputationError::NotSaved(reason)) => {
+            (Event::NotSaved { cycle: number, reason }, ComputationProduct::Nothing)
         }
     }
 }
@@ -458,8 +458,8 @@ fn register_and_evaluate(
     // The first few touches show only if the right part is in the right place. A search on them would be a guess.
     let at_fixture = task.start_at_fixture || points.tried_targets.len() == 1;
     let (mut found, options) = task.register_with_start(&part, probe_radius_mm, at_fixture).map_err(classify_error)?;
-    if let Some(why) = found.unjudgeable_reason() {
-        return Err(ComputationError::Failed(why));
+    if let Some(reason) = found.unjudgeable_reason() {
+        return Err(ComputationError::Failed(reason));
     }
     found.add_radius_uncertainty(points.probe_radius_sigma_mm.hypot(task.machine_uncertainty.reference_sphere_mm));
     let given = ModelInputs {
@@ -532,9 +532,9 @@ fn register_and_evaluate(
     if next.is_none() {
         figures.warnings.extend(form.as_ref().err().map(untold));
     }
-    figures.further_touches = next
-        .as_ref()
-        .map(|(next, why)| Box::new(FurtherTouches { target_count: next.len() as u32, reason: (*why).to_owned() }));
+    figures.further_touches = next.as_ref().map(|(next, reason)| {
+        Box::new(FurtherTouches { target_count: next.len() as u32, reason: (*reason).to_owned() })
+    });
     if next.is_some() && form.is_err() {
         // The first few touches have six motions fitted: their residuals say nothing about the form.
         figures.form = None;
@@ -555,8 +555,9 @@ fn register_and_evaluate(
     let again = again.filter(|_| task.tolerance.outliers_decide(&figures));
     if let Some(again) = again.as_ref().filter(|_| points.repeat_rounds == 0) {
         let targets = again.targets.len() as u32;
-        let why = "a touch is an outlier, so this touch is repeated, with a few touches near the same place".to_owned();
-        figures.further_touches = Some(Box::new(FurtherTouches { target_count: targets, reason: why }));
+        let reason =
+            "a touch is an outlier, so this touch is repeated, with a few touches near the same place".to_owned();
+        figures.further_touches = Some(Box::new(FurtherTouches { target_count: targets, reason }));
     }
     let field = next.is_none().then(|| form.as_ref().ok()?.hyperparameters_without_prior).flatten();
     Ok(RegistrationProduct {
@@ -791,11 +792,11 @@ pub(super) fn compensate_cycle(
 ) -> (Event, ComputationProduct) {
     match compute_correction(task, files, cycle) {
         Ok((summary, next)) => (Event::Compensated { cycle: number, summary }, ComputationProduct::Correction(next)),
-        Err(ComputationError::Failed(why)) => {
-            (Event::CompensationRefused { cycle: number, reason: why }, ComputationProduct::Nothing)
+        Err(ComputationError::Failed(reason)) => {
+            (Event::CompensationRefused { cycle: number, reason }, ComputationProduct::Nothing)
         }
-        Err(ComputationError::NotSaved(why)) => {
-            (Event::NotSaved { cycle: number, reason: why }, ComputationProduct::Nothing)
+        Err(ComputationError::NotSaved(reason)) => {
+            (Event::NotSaved { cycle: number, reason }, ComputationProduct::Nothing)
         }
     }
 }

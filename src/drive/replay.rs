@@ -301,8 +301,8 @@ impl<'t> Replay<'t> {
             ),
             _ => pipeline::compensate_cycle(self.task, &mut files, number, &cycle),
         };
-        if let Event::NotSaved { reason: why, .. } = again {
-            let what = super::failure_message(&why);
+        if let Event::NotSaved { reason, .. } = again {
+            let what = super::failure_message(&reason);
             return Err(ReplayError::NotSaved { run: self.run_folder.to_owned(), what });
         }
         let [recorded, again] = [event, &again].map(|event| serde_json::to_value(event).unwrap_or_default());

@@ -332,8 +332,8 @@ impl<B: StationDriver> MachineTask<B> {
     ) {
         let (reports, name) = (self.reports.clone(), B::DEVICE);
         let Err(error) = tokio::spawn(self.serve_requests(asks, poll, aborts, pulse)).await else { return };
-        let why = format!("a fault of the program Regrind; report this fault: {}", panic_message(error));
-        let event = Some(Event::StationFailed { device: name, reason: why });
+        let reason = format!("a fault of the program Regrind; report this fault: {}", panic_message(error));
+        let event = Some(Event::StationFailed { device: name, reason });
         let _ = reports.send(StationReport { event, ..StationReport::default() }).await;
     }
 
@@ -437,21 +437,21 @@ impl<B: StationDriver> MachineTask<B> {
             Ok::<_, DeviceError>((identity, Ok(status)))
         };
         match connected.await {
-            Ok((_, Err(found))) => {
-                self.report(Event::NotConnected { device: B::DEVICE, reason: ConnectionRefusal::AtAnotherJob(found) })
-                    .await;
+            Ok((_, Err(occupation))) => {
+                self.report(Event::NotConnected {
+                    device: B::DEVICE,
+                    reason: ConnectionRefusal::AtAnotherJob(occupation),
+                })
+                .await;
             }
             Ok((identity, Ok(status))) => {
                 self.observed.connected = true;
                 self.observed.state = Some(status.state);
-                let found = self.occupation(&status).await;
+                let occupation = self.occupation(&status).await;
                 let (device, boot_id, simulated) = (B::DEVICE, identity.boot_id, identity.simulation);
                 let detail = serde_json::json!({ "name": identity.name, "address": self.driver.machine().name() });
-                self.report_with_detail(
-                    Event::Connected { device, boot_id, simulated, occupation: found },
-                    Some(detail),
-                )
-                .await;
+                self.report_with_detail(Event::Connected { device, boot_id, simulated, occupation }, Some(detail))
+                    .await;
             }
             Err(error) => self.report(Event::NotConnected { device: B::DEVICE, reason: mismatch(&error) }).await,
         }
@@ -516,10 +516,8 @@ impl<B: StationDriver> MachineTask<B> {
         let cycle = number.cycle;
         self.armed = None;
         let Some(digest) = self.loaded_digest else {
-            let why = "no payload was loaded".to_owned();
-            return self
-                .report(Event::Refused { device: B::DEVICE, request: MachineRequest::Prepare, reason: why })
-                .await;
+            let reason = "no payload was loaded".to_owned();
+            return self.report(Event::Refused { device: B::DEVICE, request: MachineRequest::Prepare, reason }).await;
         };
         let job = Job { job: self.job, cycle: number.encode(), digest };
         let prepared = async {
@@ -544,10 +542,8 @@ impl<B: StationDriver> MachineTask<B> {
     async fn start(&mut self, cycle: u32) {
         let armed = self.armed.clone().filter(|armed| armed.job.batch_id().cycle == cycle);
         let Some(armed) = armed else {
-            let why = "it is not prepared".to_owned();
-            return self
-                .report(Event::Refused { device: B::DEVICE, request: MachineRequest::Start, reason: why })
-                .await;
+            let reason = "it is not prepared".to_owned();
+            return self.report(Event::Refused { device: B::DEVICE, request: MachineRequest::Start, reason }).await;
         };
         if self.observed.link_lost {
             return self.refuse_unsent(MachineRequest::Start).await;
@@ -583,9 +579,9 @@ impl<B: StationDriver> MachineTask<B> {
 
     /// Reports a command as refused that the station did not send, because the link was lost after the cell had issued
     /// it. It is not sent later either, so it cannot move the machine.
-    async fn refuse_unsent(&mut self, what: MachineRequest) {
-        let why = "the link is lost, so the command was not sent".to_owned();
-        self.report(Event::Refused { device: B::DEVICE, request: what, reason: why }).await;
+    async fn refuse_unsent(&mut self, request: MachineRequest) {
+        let reason = "the link is lost, so the command was not sent".to_owned();
+        self.report(Event::Refused { device: B::DEVICE, request, reason }).await;
     }
 
     async fn hold(&mut self) {
@@ -637,10 +633,10 @@ impl<B: StationDriver> MachineTask<B> {
     async fn abort(&mut self) {
         self.observed.aborting = true;
         if !self.observed.connected
-            && let Err(why) = self.connect_for_abort().await
+            && let Err(reason) = self.connect_for_abort().await
         {
             let device = B::DEVICE;
-            return self.report(Event::Refused { device, request: MachineRequest::Abort, reason: why }).await;
+            return self.report(Event::Refused { device, request: MachineRequest::Abort, reason }).await;
         }
         match self.driver.machine().abort().await {
             Ok(status) => self.report_changes(&status).await,
@@ -680,10 +676,10 @@ impl<B: StationDriver> MachineTask<B> {
     async fn reconcile(&mut self, cycle: u32) {
         let Some(armed) = self.armed.clone().filter(|armed| armed.job.batch_id().cycle == cycle) else {
             // The machine cannot be asked about a job that this program has not prepared, and nothing is concluded.
-            let why =
+            let reason =
                 "Regrind has not prepared the machine in this cycle, so Regrind cannot ask the machine about the job"
                     .to_owned();
-            let outcome = Reconciliation::Unknown(why);
+            let outcome = Reconciliation::Unknown(reason);
             return self.report(Event::Reconciled { device: B::DEVICE, cycle, outcome }).await;
         };
         let outcome = match self.driver.machine().reconcile(&armed).await {
@@ -701,7 +697,7 @@ impl<B: StationDriver> MachineTask<B> {
                 self.observed.running = false;
                 Reconciliation::NotStarted
             }
-            Ok(Reconciled::Unknown { reason: why }) => Reconciliation::Unknown(why),
+            Ok(Reconciled::Unknown { reason }) => Reconciliation::Unknown(reason),
             Ok(answer) => Reconciliation::Unknown(format!("unknown answer: {answer:?}")),
             Err(error) if error.is_link() => return self.report_link_lost(&error).await,
             Err(error) => Reconciliation::Unknown(error.to_string()),
@@ -717,11 +713,10 @@ impl<B: StationDriver> MachineTask<B> {
     async fn collect(&mut self, cycle: u32) {
         let armed = self.armed.as_ref().filter(|armed| armed.job.batch_id().cycle == cycle);
         let Some(job) = armed.map(|armed| armed.job) else {
-            let why = "Regrind has not prepared the machine for a job of this cycle, so there is no result to collect"
-                .to_owned();
-            return self
-                .report(Event::Refused { device: B::DEVICE, request: MachineRequest::Collect, reason: why })
-                .await;
+            let reason =
+                "Regrind has not prepared the machine for a job of this cycle, so there is no result to collect"
+                    .to_owned();
+            return self.report(Event::Refused { device: B::DEVICE, request: MachineRequest::Collect, reason }).await;
         };
         match self.driver.fetch(job, &self.interrupt).await {
             // The drive checks the points and reports to the cell; this only hands them over.
@@ -752,9 +747,9 @@ impl<B: StationDriver> MachineTask<B> {
         match acknowledged.await {
             // A result that does not exist yet is not acknowledged.
             Ok(status) if status.state.is_moving() || status.state == MachineState::Held => {
-                let (device, why) =
+                let (device, reason) =
                     (B::DEVICE, format!("{} is still {}", self.driver.machine().name(), describe_job(&status)));
-                self.report(Event::Refused { device, request: MachineRequest::Discard, reason: why }).await;
+                self.report(Event::Refused { device, request: MachineRequest::Discard, reason }).await;
             }
             Ok(status) => {
                 self.observed.state = Some(status.state);
@@ -767,7 +762,7 @@ impl<B: StationDriver> MachineTask<B> {
 
     /// Reports to the cell that the request `what` failed with `error`. If the link is lost, reports the loss first.
     /// Then reports a fault of the machine as a fault, and every other error as a refusal of the request.
-    async fn report_failure(&mut self, what: MachineRequest, error: DeviceError) {
+    async fn report_failure(&mut self, request: MachineRequest, error: DeviceError) {
         if error.is_link() {
             self.report_link_lost(&error).await;
         }
@@ -776,7 +771,7 @@ impl<B: StationDriver> MachineTask<B> {
                 let (device, message) = (B::DEVICE, fault_message(B::DEVICE, fault));
                 self.report(Event::Fault { device, code: fault.number(), message }).await;
             }
-            _ => self.report(Event::Refused { device: B::DEVICE, request: what, reason: error.to_string() }).await,
+            _ => self.report(Event::Refused { device: B::DEVICE, request, reason: error.to_string() }).await,
         }
     }
 
@@ -946,9 +941,9 @@ impl<B: StationDriver> MachineTask<B> {
                     && self.observed.running
                     && self.observed.progress_rises_at_held.is_multiple_of(MOVING_AFTER_RISES)
                 {
-                    let why =
+                    let reason =
                         format!("the machine reports HELD, but the progress of the job has risen to {done} of {total}");
-                    self.report(Event::Refused { device, request: MachineRequest::Hold, reason: why }).await;
+                    self.report(Event::Refused { device, request: MachineRequest::Hold, reason }).await;
                 }
             }
             None => self.observed.progress_rises_at_held = 0,
@@ -956,8 +951,9 @@ impl<B: StationDriver> MachineTask<B> {
         let is_late = self.observed.stop_accepted_at.is_some_and(|taken| taken.elapsed() > STOP_TIMEOUT);
         if self.observed.stopping && is_late && status.state == MachineState::Execute {
             self.observed.stop_accepted_at = None;
-            let why = format!("the machine accepted STOP, but is still in EXECUTE {} s later", STOP_TIMEOUT.as_secs());
-            self.report(Event::Refused { device, request: MachineRequest::Stop, reason: why }).await;
+            let reason =
+                format!("the machine accepted STOP, but is still in EXECUTE {} s later", STOP_TIMEOUT.as_secs());
+            self.report(Event::Refused { device, request: MachineRequest::Stop, reason }).await;
         }
     }
 
@@ -970,8 +966,9 @@ impl<B: StationDriver> MachineTask<B> {
             return;
         };
         if f64::from(done) < MIN_COMPLETE_SHARE * f64::from(total) {
-            let why = format!("the grinder reports the pass as complete, but the progress is only {done} of {total}");
-            self.report(Event::RecordDoubted { cycle: self.cycle, reason: why }).await;
+            let reason =
+                format!("the grinder reports the pass as complete, but the progress is only {done} of {total}");
+            self.report(Event::RecordDoubted { cycle: self.cycle, reason }).await;
         }
     }
 

@@ -397,8 +397,8 @@ mod tests {
     fn alarms_translated_in_every_language() {
         for &id in AlarmId::ALL {
             let remedy = id.remedy().iter().map(|line| (*line).to_owned()).collect::<Vec<_>>();
-            let what = format!("{}: grinder at 12 mm.", id.head());
-            let alarm = Alarm { id, event: what, consequence: "c".to_owned(), remedy, cleared_by: Role::Operator };
+            let event = format!("{}: grinder at 12 mm.", id.head());
+            let alarm = Alarm { id, event, consequence: "c".to_owned(), remedy, cleared_by: Role::Operator };
             for language in [Language::De, Language::Zh] {
                 let said = alarm_texts(&alarm, language);
                 assert!(said.event.ends_with(": grinder at 12 mm."), "{id:?}: {}", said.event);

@@ -138,7 +138,7 @@ pub(crate) async fn take_control(
 
 fn answered(reply: std::io::Result<Reply>) -> Response {
     match reply {
-        Ok(Reply { accepted: taken, message, .. }) => Json(Answer { accepted: taken, message }).into_response(),
+        Ok(Reply { accepted, message, .. }) => Json(Answer { accepted, message }).into_response(),
         Err(error) => {
             let message =
                 format!("the program that runs the cell does not answer: {error}; check that this program still runs");

@@ -256,7 +256,7 @@ fn next(seen: &ObservedRun, language: Language) -> Markup {
 /// Returns the HTML of the progress of the current job (work of one machine, such as grinding or measuring). The HTML
 /// is empty if no job runs.
 fn job(live: &Snapshot, language: Language) -> Markup {
-    let Some(JobProgress { device, done, total, remaining_s: left_s }) = live.progress else {
+    let Some(JobProgress { device, done, total, remaining_s }) = live.progress else {
         return Markup::default();
     };
     let percent = 100.0 * f64::from(done.min(total)) / f64::from(total.max(1));
@@ -265,13 +265,13 @@ fn job(live: &Snapshot, language: Language) -> Markup {
         p .phase {
             span { (device) " " (live.phase.map_or("", |phase| texts::phase(phase).to(language))) (unit) }
             strong { (format!("{percent:.0} %")) }
-            @if let Some(left) = left_s { span .left { (range(left)) " " (Text::TimeLeft.to(language)) } }
+            @if let Some(left) = remaining_s { span .left { (range(left)) " " (Text::TimeLeft.to(language)) } }
         }
         progress max=(total.max(1)) value=(done) aria-label=(device) {}
         @if let Some(PreviewStatistics { touch_count, rms_um, min_um, max_um }) = live.preview {
             p .quiet title=(Text::PreliminaryMeans.to(language)) {
-                (Text::PreliminaryPoints.to(language)) ": " (touched) " " (Text::Touched.to(language))
-                (format!(", RMS {rms_um:.2} µm, min {least_um:+.2} µm, max {most_um:+.2} µm"))
+                (Text::PreliminaryPoints.to(language)) ": " (touch_count) " " (Text::Touched.to(language))
+                (format!(", RMS {rms_um:.2} µm, min {min_um:+.2} µm, max {max_um:+.2} µm"))
             }
         }
     }

@@ -295,15 +295,15 @@ fn parameters(story: &RunHistory) -> String {
         let RecordedParameter {
             name,
             unit,
-            estimate: off,
-            expanded_uncertainty: expanded,
-            compensated: taken,
-            total_correction: told,
-            rms_reduction_um: removes_rms_um,
+            estimate,
+            expanded_uncertainty,
+            compensated,
+            total_correction,
+            rms_reduction_um,
         } = of;
         format!(
-            "<tr><td class=\"n\">{number}</td><td>{}</td><td class=\"n\">{off:.2} \u{b1} {expanded:.2} {unit}</td>\
-             <td class=\"n\">{taken:.2} {unit}</td><td class=\"n\">{told:.2} {unit}</td><td class=\"n\">{removes_rms_um:.2}</td></tr>\n",
+            "<tr><td class=\"n\">{number}</td><td>{}</td><td class=\"n\">{estimate:.2} \u{b1} {expanded_uncertainty:.2} {unit}</td>\
+             <td class=\"n\">{compensated:.2} {unit}</td><td class=\"n\">{total_correction:.2} {unit}</td><td class=\"n\">{rms_reduction_um:.2}</td></tr>\n",
             escaped(name)
         )
     };
@@ -312,8 +312,8 @@ fn parameters(story: &RunHistory) -> String {
     if rows.is_empty() {
         return String::new();
     }
-    let told = story.cycles.iter().filter(|(_, cycle)| !cycle.parameters.is_empty());
-    let left = told.filter_map(|(number, cycle)| Some((number, cycle.map_rms_mm?)));
+    let stated = story.cycles.iter().filter(|(_, cycle)| !cycle.parameters.is_empty());
+    let left = stated.filter_map(|(number, cycle)| Some((number, cycle.map_rms_mm?)));
     let left: String = left
         .map(|(number, mm)| {
             format!("<p>Error that remains for the correction map after cycle {number}: {} µm RMS.</p>\n", um(mm))

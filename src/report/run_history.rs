@@ -177,10 +177,10 @@ impl RunHistory {
                 let standing = |a: &&mut AlarmHistory| a.alarm.id == alarm && a.withdrawn.is_none();
                 self.alarms.iter_mut().filter(standing).for_each(|a| a.withdrawn = Some(record.utc.clone()));
             }
-            Command::Refuse { event, reason: why, .. } => {
+            Command::Refuse { event, reason, .. } => {
                 let given = |order: &&mut Order| order.event.as_ref() == Some(&*event) && order.refused.is_none();
                 if let Some(order) = self.orders.iter_mut().rev().find(given) {
-                    order.refused = Some(why);
+                    order.refused = Some(reason);
                 }
             }
             Command::Finish(ending) => self.ending = Some(ending),
@@ -234,8 +234,8 @@ impl RunHistory {
                 story.expected_mm = Some([summary.predicted_pv_mm, summary.predicted_rms_mm]);
                 (story.parameters, story.map_rms_mm) = (summary.parameters, summary.map_rms_mm);
             }
-            Event::RegistrationFailed { cycle, reason: why } => {
-                self.measurement(cycle).unusable = Some(format!("not registered: {why}"));
+            Event::RegistrationFailed { cycle, reason } => {
+                self.measurement(cycle).unusable = Some(format!("not registered: {reason}"));
             }
             event if event.actor().is_some() => {
                 self.orders.push(Order { record, event: Some(event), refused: None });

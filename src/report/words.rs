@@ -206,7 +206,7 @@ fn command_words(command: &Command) -> String {
         Command::Announce(judgement) => judgement_words(judgement),
         Command::Raise(alarm) => format!("ALARM {} {}", alarm.event, alarm.consequence),
         Command::Withdraw { alarm } => format!("alarm withdrawn: {}", spaced(&format!("{alarm:?}"))),
-        Command::Refuse { event, state, reason: why } => format!("{} refused in {state}: {why}", spaced(event.name())),
+        Command::Refuse { event, state, reason } => format!("{} refused in {state}: {reason}", spaced(event.name())),
         Command::Finish(ending) => format!("finish, {}", ending_words(ending)),
         command => {
             let name = command.name();
@@ -226,20 +226,22 @@ fn event_words(event: &Event) -> String {
         | Event::Stop { reason, .. }
         | Event::Abort { reason, .. } => reason.clone(),
         Event::DeclaredOver { evidence, .. } => evidence.clone(),
-        Event::Connected { simulated, occupation: found, .. } => found_words(*simulated, found),
-        Event::NotConnected { reason: why, .. } => mismatch_words(why),
-        Event::LinkLost { reason: why, .. }
-        | Event::StartUnknown { reason: why, .. }
-        | Event::RegistrationFailed { reason: why, .. } => why.clone(),
+        Event::Connected { simulated, occupation, .. } => found_words(*simulated, occupation),
+        Event::NotConnected { reason, .. } => mismatch_words(reason),
+        Event::LinkLost { reason, .. }
+        | Event::StartUnknown { reason, .. }
+        | Event::RegistrationFailed { reason, .. } => reason.clone(),
         Event::ConditionLost { condition, message, .. } => format!("{condition}: {message}"),
         Event::ConditionBack { condition, .. } => condition.to_string(),
         Event::Progressed { done, total, .. } => format!("{done} of {total}"),
         Event::Ended { result, .. } => result.to_string(),
         Event::Obstructed { message, .. } => message.clone(),
-        Event::Refused { request: what, reason: why, .. } => format!("{}: {why}", spaced(&format!("{what:?}"))),
+        Event::Refused { request, reason, .. } => format!("{}: {reason}", spaced(&format!("{request:?}"))),
         Event::Fault { code, message, .. } => format!("{code}, {message}"),
         Event::Reconciled { outcome, .. } => reconciliation_words(outcome),
-        Event::Collected { targets, found, gate, .. } => format!("{found} of {targets} points, {}", gate_words(gate)),
+        Event::Collected { targets, found, gate, .. } => {
+            format!("{found} of {targets} points, {}", gate_words(gate))
+        }
         Event::Qualified { radius_error_mm, .. } => {
             format!("radius error of the probe {:.2} µm", 1e3 * radius_error_mm)
         }
@@ -256,7 +258,7 @@ fn event_words(event: &Event) -> String {
                 .map(|said| format!("; {said}"))
                 .collect::<String>()
         ),
-        Event::CompensationRefused { reason: why, .. } => match why {
+        Event::CompensationRefused { reason, .. } => match reason {
             CompensationRefusal::BudgetSpent(words) | CompensationRefusal::Failed(words) => words.clone(),
             CompensationRefusal::WeakDirections(directions) => format!("weak directions: {}", directions.join(", ")),
         },

@@ -48,12 +48,12 @@ async fn status_shows_preliminary_touches() {
     // Eight full pages of seven points, including those on the reference sphere. The first pages are enough.
     let told = seen(&folder, |status| status.preview.filter(|told| told.touch_count >= 14)).await;
     let PreviewStatistics { touch_count, rms_um, min_um, max_um } = told;
-    assert!(touched <= 90 && rms_um > 0.0 && rms_um <= least_um.abs().max(most_um.abs()), "{told:?}");
+    assert!(touch_count <= 90 && rms_um > 0.0 && rms_um <= min_um.abs().max(max_um.abs()), "{told:?}");
     // After a hold, the points stay visible. Orders are obeyed as usual.
     let (reply, ..) = order(&folder, Request::Hold { reason: "to look".into() }).await;
     assert!(reply.accepted, "{reply:?}");
     until(&folder, |words| words.starts_with("Held (Measure, Run)")).await;
-    assert!(seen(&folder, |status| status.preview).await.touch_count >= touched);
+    assert!(seen(&folder, |status| status.preview).await.touch_count >= touch_count);
     let (reply, ..) = order(&folder, Request::Resume { reason: String::new(), state_number: None }).await;
     assert!(reply.accepted, "{reply:?}");
     cmm(&rig, |machine| machine.set_speed(5000.0));

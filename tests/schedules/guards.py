@@ -26,7 +26,7 @@ GUARDS = {
     "an abort waits for no record": (
         "src/drive/mod.rs", "            | Command::AbortMachine { .. }\n            | Command::VerifyClear", "            | Command::VerifyClear"),
     "a START without an answer is unknown": (
-        "src/drive/station.rs", "self.report(Event::StartUnknown { device: B::DEVICE, cycle, why: error.to_string() }).await;",
+        "src/drive/station.rs", "self.report(Event::StartUnknown { device: B::DEVICE, cycle, reason: error.to_string() }).await;",
         "self.observed.running = false; self.report_failure(MachineRequest::Start, error).await;"),
     "a START that was not seen is fenced off": (
         "src/device/modbus/mod.rs", "        self.claim().await?;\n        let second", "        let second",

@@ -908,8 +908,8 @@ fn abort_spares_machine_of_another_run() {
     let mut run = TestRun::accepted_after_two_passes();
     run.start().run_until(State::Execute(Phase::Measure(JobStep::Run))).open_commands.clear();
     run.send(Event::Restarted { actor: actor() });
-    let why = ConnectionRefusal::AtAnotherJob("EXECUTE with job 9, cycle 1".into());
-    run.send(Event::NotConnected { device: Device::Grinder, reason: why });
+    let reason = ConnectionRefusal::AtAnotherJob("EXECUTE with job 9, cycle 1".into());
+    run.send(Event::NotConnected { device: Device::Grinder, reason });
     assert!(run.alarms().contains(&AlarmId::NotIdle));
     let commands = run.send(Event::Abort { actor: actor(), reason: String::new() });
     assert!(commands.contains(&Command::AbortMachine { device: Device::Cmm }), "{commands:?}");
@@ -921,8 +921,8 @@ fn declared_over_remeasures_lost_result() {
     let mut run = TestRun::accepted_after_two_passes();
     run.start().run_until(State::Execute(Phase::Measure(JobStep::Collect))).open_commands.clear();
     run.send(hold());
-    let (device, what) = (Device::Cmm, MachineRequest::Collect);
-    run.send(Event::Refused { device, request: what, reason: "it holds no result".into() });
+    let (device, request) = (Device::Cmm, MachineRequest::Collect);
+    run.send(Event::Refused { device, request, reason: "it holds no result".into() });
     assert_eq!(run.cell.state(), State::Held(Phase::Measure(JobStep::Collect)));
     run.send(Event::DeclaredOver { actor: actor(), device, evidence: "it was switched off".into() });
     run.run_until(State::Held(Phase::Measure(JobStep::Send)));
@@ -1577,7 +1577,7 @@ fn manual_mode_holds_and_blocks_start() {
         // Nobody goes on beside it.
         let commands = run.send(resume());
         assert!(
-            matches!(&commands[..], [Command::Refuse { reason, .. }] if why.contains("manual mode")),
+            matches!(&commands[..], [Command::Refuse { reason, .. }] if reason.contains("manual mode")),
             "{commands:?}"
         );
         run.send(Event::AutomaticAgain { device });
@@ -1636,8 +1636,8 @@ fn motion_of_idle_machine_holds_both() {
     run.send(Event::MachineHeld { device: moves });
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)));
     // It does not hold: only the safe sequence is left.
-    let why = "local".to_owned();
-    let commands = run.send(Event::Refused { device: strays, request: MachineRequest::Hold, reason: why });
+    let reason = "local".to_owned();
+    let commands = run.send(Event::Refused { device: strays, request: MachineRequest::Hold, reason });
     assert!(commands.contains(&Command::AbortMachine { device: strays }), "{commands:?}");
     // Before the START of the other one.
     let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));

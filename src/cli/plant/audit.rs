@@ -56,12 +56,12 @@ pub(in super::super) fn prove(
         if let Some(folder) = &folder {
             found.check_local_journal(folder)?;
         }
-        let told = json!({
+        let content = json!({
             "run": found.name, "cell": found.cell, "sound": true, "records": proven.records, "head": proven.head,
             "closed": proven.closed, "artefacts": proven.artefacts, "keys": proven.keys, "seals": proven.seals, "signed": proven.signed,
         });
         if json && folder.is_none() {
-            super::super::print_json(&told)?;
+            super::super::print_json(&content)?;
         } else if !json {
             let signed = match proven.signed {
                 0 => "not signed".to_owned(),
@@ -76,6 +76,6 @@ pub(in super::super) fn prove(
                 if folder.is_some() { "; the local journal contains these records" } else { "" }
             ))?;
         }
-        Ok(Copy { is_here: folder.is_some(), content: told })
+        Ok(Copy { is_here: folder.is_some(), content })
     })
 }

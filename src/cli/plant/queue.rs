@@ -43,7 +43,7 @@ pub(super) struct ToQueue {
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
-  regrind plant unqueue 17 --why \"the blank is broken\" --plant planner.toml
+  regrind plant unqueue 17 --reason \"the blank is broken\" --plant planner.toml
 
 Exit codes: 0 removed; 1 the part is started, or there is no such part; 2 the database refuses the command; 3 the
 database cannot be reached.")]
@@ -52,7 +52,7 @@ pub(super) struct ToUnqueue {
     #[arg(value_name = "N")]
     work: i64,
     /// Reason, for the record
-    #[arg(long, value_name = "WORDS", value_parser = name)]
+    #[arg(long, alias = "why", value_name = "WORDS", value_parser = name)]
     reason: String,
     #[command(flatten)]
     plant: Where,
@@ -93,10 +93,10 @@ pub(super) fn queue(arguments: &ToQueue) -> Result<Outcome, Failure> {
 
 pub(super) fn unqueue(arguments: &ToUnqueue) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
-    let ToUnqueue { work, reason: why, .. } = arguments;
+    let ToUnqueue { work, reason, .. } = arguments;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
-        let done = link.query("SELECT withdraw_work($1, $2)", &[work, why]).await?;
+        let done = link.query("SELECT withdraw_work($1, $2)", &[work, reason]).await?;
         if done.first().is_some_and(|row| row.get(0)) {
             super::super::print(&format!("the part with number {work} is removed from the queue\n"))?;
             return Ok(Outcome::Accepted);

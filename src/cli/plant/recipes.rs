@@ -72,7 +72,7 @@ pub(super) struct ToApprove {
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
-  regrind plant withdraw freeform-mirror --version 3 --why \"wrong radius of the wheel\" --plant planner.toml
+  regrind plant withdraw freeform-mirror --version 3 --reason \"wrong radius of the wheel\" --plant planner.toml
 
 Exit codes: 0 withdrawn; 1 there is no such recipe, or the recipe was withdrawn before; 2 the database refuses the command;
 3 the database cannot be reached.")]
@@ -84,7 +84,7 @@ pub(super) struct ToWithdraw {
     #[arg(long, value_name = "N")]
     version: i32,
     /// Reason, for the record
-    #[arg(long, value_name = "WORDS", value_parser = name)]
+    #[arg(long, alias = "why", value_name = "WORDS", value_parser = name)]
     reason: String,
     #[command(flatten)]
     plant: Where,
@@ -180,10 +180,10 @@ pub(super) fn approve(arguments: &ToApprove) -> Result<Outcome, Failure> {
 
 pub(super) fn withdraw(arguments: &ToWithdraw) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
-    let ToWithdraw { name, version, reason: why, .. } = arguments;
+    let ToWithdraw { name, version, reason, .. } = arguments;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
-        let done = link.query("SELECT withdraw_recipe($1, $2, $3)", &[name, version, why]).await?;
+        let done = link.query("SELECT withdraw_recipe($1, $2, $3)", &[name, version, reason]).await?;
         if done.first().is_some_and(|row| row.get(0)) {
             super::super::print(&format!("version {version} of {name} is withdrawn\n"))?;
             return Ok(Outcome::Accepted);

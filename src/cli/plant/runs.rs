@@ -23,7 +23,7 @@ pub(super) struct ToList {
     #[arg(long, value_name = "SERIAL")]
     part: Option<String>,
     /// Maximum number of entries
-    #[arg(long, value_name = "N", default_value_t = 40)]
+    #[arg(long, alias = "most", value_name = "N", default_value_t = 40)]
     max_rows: u32,
     #[command(flatten)]
     plant: Where,
@@ -65,7 +65,7 @@ Example:
 Exit codes: 0 listed; 2 the database refuses the command; 3 the database cannot be reached.")]
 pub(super) struct ToListIncidents {
     /// Maximum number of entries
-    #[arg(long, value_name = "N", default_value_t = 40)]
+    #[arg(long, alias = "most", value_name = "N", default_value_t = 40)]
     max_rows: u32,
     #[command(flatten)]
     plant: Where,

@@ -149,7 +149,7 @@ pub fn decide(
     let count = so_far.touched.len();
     let left = so_far.tried.iter().filter(|tried| tried.is_none()).count();
     let around = growing.untried_neighbours(so_far);
-    let why = match () {
+    let reason = match () {
         () if left == 0 => Reason::AllTargetsTried,
         () if count < MIN_TOUCHES => Reason::TooFewTouches,
         () if growing.has_feature(so_far) => Reason::NarrowFeature,
@@ -158,7 +158,7 @@ pub fn decide(
         () => reason_from_form(&form, purpose, (count, so_far.targets.len())),
     };
     let is_over = matches!(
-        why,
+        reason,
         Reason::WithinLimits
             | Reason::FormKnown
             | Reason::CorrectionPreferred
@@ -166,8 +166,8 @@ pub fn decide(
             | Reason::AllTargetsTried
     );
     let batches = so_far.tried.iter().flatten().max().map_or(0, |last| last + 1);
-    let why = if batches >= MAX_BATCHES && !is_over { Reason::MaxBatchesReached } else { why };
-    let next = match why {
+    let reason = if batches >= MAX_BATCHES && !is_over { Reason::MaxBatchesReached } else { reason };
+    let next = match reason {
         _ if is_over => Vec::new(),
         Reason::NarrowFeature | Reason::MaxBatchesReached => {
             (0..so_far.tried.len()).filter(|&k| so_far.tried[k].is_none()).collect()
@@ -177,11 +177,11 @@ pub fn decide(
             growing.choose_next(so_far, &around, wanted.max(around.len()).min(left), seed)?
         }
     };
-    let is_all = matches!(why, Reason::NarrowFeature | Reason::MaxBatchesReached);
+    let is_all = matches!(reason, Reason::NarrowFeature | Reason::MaxBatchesReached);
     let next = if is_all { next } else { short_tour(so_far.targets, next) };
     // Slopes, ISO figures and budget are computed for the last decision only.
     let form = if next.is_empty() { Form::estimate_at(registration, inputs, so_far.targets)? } else { form };
-    Ok(StoppingDecision { form, next, reason: why })
+    Ok(StoppingDecision { form, next, reason })
 }
 
 /// Returns the reason to end or to continue the measurement. The reason follows from the figures of the form (PV, PV

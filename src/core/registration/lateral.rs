@@ -207,7 +207,7 @@ mod tests {
         }
         let n = deviations.len() as f64;
         let objective_mm2 = deviations.iter().map(|d| d.deviation_mm * d.deviation_mm).sum::<f64>();
-        let words = "x and y position repeats only to 3.4 mm".to_owned();
+        let description = "x and y position repeats only to 3.4 mm".to_owned();
         let verdict = RegistrationQuality {
             inliers: deviations.len(),
             objective_mm2,

@@ -436,11 +436,11 @@ impl<M: Exchange> FolderMachine<M> {
             return Ok(Reconciled::NotStarted(self.status()));
         };
         if handed.job != intended.job || handed.sequence != intended.start_sequence {
-            let why = format!(
+            let reason = format!(
                 "the folder has a hand-over of {} with START number {}, but {} with START number {} is expected",
                 handed.job, handed.sequence, intended.job, intended.start_sequence
             );
-            return Ok(Reconciled::Unknown { reason: why });
+            return Ok(Reconciled::Unknown { reason });
         }
         self.job = Some((handed.job, handed.sequence));
         Ok(match handed.status {
@@ -465,8 +465,9 @@ impl<M: Exchange> FolderMachine<M> {
             }
             HandOverStatus::Closed => {
                 (self.state, self.job) = (MachineState::Idle, None);
-                let why = "the result of this job was already acknowledged: see the journal for the result".to_owned();
-                Reconciled::Unknown { reason: why }
+                let reason =
+                    "the result of this job was already acknowledged: see the journal for the result".to_owned();
+                Reconciled::Unknown { reason }
             }
         })
     }

@@ -142,14 +142,14 @@ impl LockFolder {
     /// files of other users in the folder. The folder cannot be created or opened.
     pub(crate) fn open(place: &Path, name: &str) -> Result<Self, BadFolder> {
         let path = place.join(name);
-        let bad = |what: String| {
+        let bad = |description: String| {
             let remedy = format!(
                 "as root, run `chown -h root:root {0}; chmod 1777 {0}` if it is a folder, or remove it if it is not, \
                  and write `d {0} 1777 root root -` into /etc/tmpfiles.d/regrind.conf; or install the package, which \
                  creates it for a group",
                 path.display()
             );
-            BadFolder { description: what, remedy }
+            BadFolder { description, remedy }
         };
         let failed = |action: &str, error: Errno| bad(format!("{action}: {}", io::Error::from(error)));
         let place = rustix::fs::open(place, AS_FOLDER, Mode::empty())

@@ -101,7 +101,7 @@ pub(crate) struct LockFolder(PathBuf);
 
 /// Reason why a folder for locks cannot be used, with the remedy.
 pub(crate) struct BadFolder {
-    pub(crate) what: String,
+    pub(crate) description: String,
     pub(crate) remedy: String,
 }
 
@@ -117,7 +117,7 @@ impl LockFolder {
         match made {
             Err(error) if !folder.is_dir() => {
                 let remedy = format!("check that {} is writable", place.display());
-                Err(BadFolder { what: format!("creating it: {error}"), remedy })
+                Err(BadFolder { description: format!("creating it: {error}"), remedy })
             }
             _ => Ok(Self(folder)),
         }

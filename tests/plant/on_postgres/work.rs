@@ -82,7 +82,7 @@ fn queue_runs_parts_by_due_date() {
             at_cell.output_lines
         );
     }
-    plant.does(&["plant", "unqueue", "2", "--why", "broken", "--plant", "planner.toml"]);
+    plant.does(&["plant", "unqueue", "2", "--reason", "broken", "--plant", "planner.toml"]);
     plant.ends(&["plant", "unqueue", "3", "--why", "broken", "--plant", "planner.toml"], 1);
     let left: Vec<_> = work(&plant).into_iter().filter(|part| part["state"] == "open").collect();
     assert!(left.len() == 1 && left[0]["serial"] == "SN-3", "{left:?}");
@@ -168,7 +168,7 @@ fn unsigned_recipe_refused_as_incident() {
     plant.ends(&["work", "--plant", "cell-2.toml", "--once", "--part", "SN-1"], 2);
     // The part remains available to a cell that is allowed to make it, and nobody has begun it.
     assert_eq!(work(&plant)[0]["state"], "open");
-    plant.does(&["plant", "withdraw", "small", "--version", "1", "--why", "wrong wheel", "--plant", "planner.toml"]);
+    plant.does(&["plant", "withdraw", "small", "--version", "1", "--reason", "wrong wheel", "--plant", "planner.toml"]);
     let said = plant.does(&make);
     assert!(said.contains("no part is waiting"), "{said}");
     let (_, told) = plant.ends(&["plant", "propose", "small.toml", "--name", "panel", "--plant", "planner.toml"], 2);
@@ -266,7 +266,7 @@ fn dead_run_does_not_block_queue() {
     queue(&plant, "SN-1", &[]);
     let make = ["work", "--plant", "cell-1.toml", "--part", "SN-1", "--once"];
     let back = ["work", "--plant", "cell-1.toml", "--give-back", "SN-1"];
-    let up = ["work", "--plant", "cell-1.toml", "--give-up", "SN-1", "--why", "its program is gone"];
+    let up = ["work", "--plant", "cell-1.toml", "--give-up", "SN-1", "--reason", "its program is gone"];
     // No request was sent to a machine: the part is unchanged.
     begun_and_died(&plant, "run-1", 0);
     let (_, told) = plant.ends(&make, 1);

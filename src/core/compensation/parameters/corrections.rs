@@ -144,8 +144,8 @@ impl ParameterCorrections {
         let motion = AbsorbedMotion::fit(contacts, options.free_motions, |c| of(c, None));
         let displaced_mm: Vec<f64> = nodes.iter().map(|node| of(node, None)).collect();
         let setting_mm = nodes.iter().map(|node| of(node, Some(ParameterKind::WheelRadius))).collect();
-        let seen_mm = nodes.iter().zip(&displaced_mm).map(|(node, of)| of - motion.at(node)).collect();
-        Some(Self { values, since_cycle, displacement_mm: displaced_mm, setting_mm, apparent_mm: seen_mm })
+        let apparent_mm = nodes.iter().zip(&displaced_mm).map(|(node, of)| of - motion.at(node)).collect();
+        Some(Self { values, since_cycle, displacement_mm: displaced_mm, setting_mm, apparent_mm })
     }
 
     /// Returns the correction of one parameter: its difference from the value stated in the recipe, in millimetres or
