@@ -120,7 +120,7 @@ fn write(path: &ToolPath, summary: &PathSummary, file: &Path) {
             arcs_within_mm: None,
         },
     };
-    let (dialect, _) = read_dialect(Path::new("config/dialects/linuxcnc.toml")).expect("a dialect that ships");
+    let dialect = read_dialect(Path::new("config/dialects/linuxcnc.toml")).expect("a dialect that ships").dialect;
     write_program(file, &header, &dialect, summary, path).expect("a program");
 }
 

@@ -1,5 +1,6 @@
-//! One function for every parser of what comes from outside: it gives the parser any bytes, and holds what comes out against what
-//! may come out. An error is fine; a panic is not, nor is a number that is none. Each returns whether something was read.
+//! One function for every parser of what comes from outside: it gives the parser any bytes, and holds what comes out
+//! against what may come out. An error is fine; a panic is not, nor is a number that is none. Each returns whether
+//! something was read.
 //!
 //! `fuzz_targets` gives them what libFuzzer thinks of, `tests/parsers.rs` a bounded number of damaged samples.
 
@@ -288,7 +289,8 @@ fn judge(journal: &[u8], anchor: &[u8]) -> bool {
     verify(home.path()).is_ok()
 }
 
-/// A journal in which some bytes were changed: three bytes a change, where and to what; or, after a first byte of 0xff, any file.
+/// A journal in which some bytes were changed: three bytes a change, where and to what; or, after a first byte of 0xff,
+/// any file.
 ///
 /// What is verified is then what was written: a change is found, unless it is where SQLite keeps nothing.
 pub fn journal(bytes: &[u8]) -> bool {
@@ -303,7 +305,8 @@ pub fn journal(bytes: &[u8]) -> bool {
     judge(&changed, ANCHOR)
 }
 
-/// The anchor beside a journal: only one with the head that is there is believed, or one of no record, which proves nothing.
+/// The anchor beside a journal: only one with the head that is there is believed, or one of no record, which proves
+/// nothing.
 pub fn anchor(bytes: &[u8]) -> bool {
     let is_believed = judge(JOURNAL, bytes);
     if is_believed {

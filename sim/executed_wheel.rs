@@ -14,8 +14,8 @@
 //!
 //! **Tracks.** A track begins when the wheel comes near the part, and ends when it lifts off or turns back in x. A
 //! track grinds the strip half way to its neighbours, with the depth at its own y: the ridges between are the
-//! [`Grooves`] of the part. A track is therefore ground only when the next one or [`Wheel::finish_waiting_track`] comes. Beyond the
-//! outermost track, the wheel leaves its own curve. Tracks must run along x.
+//! [`Grooves`] of the part. A track is therefore ground only when the next one or [`Wheel::finish_waiting_track`]
+//! comes. Beyond the outermost track, the wheel leaves its own curve. Tracks must run along x.
 //!
 //! **Passes.** A pass lasts from when the wheel comes to the part until the part is taken away; the wheel is dressed
 //! before.

@@ -322,7 +322,7 @@ impl Map {
         exact(bytes, 96, nodes, 8)?;
         let first_mm = reader.vector("place of the first node")?;
         let spacing_mm = reader.vector::<2>("spacing")?;
-        let largest_mm = reader.f64("largest value")?;
+        let max_mm = reader.f64("largest value")?;
         reader.zeros::<8>("largest value")?;
         let nominal = reader.read_bytes()?;
         if !spacing_mm.iter().all(|s| (1e-6..=1e6).contains(s)) {
@@ -330,8 +330,8 @@ impl Map {
         }
         let values_mm = (0..nodes).map(|_| reader.f64("a node of the map")).collect::<Result<Vec<_>, _>>()?;
         let map = Self { columns, rows, first_mm, spacing_mm, nominal, values_mm };
-        if (map.max_abs_mm() - largest_mm).abs() > 1e-9 {
-            return Err(broken(format!("largest value is {} mm, the header says {largest_mm}", map.max_abs_mm())));
+        if (map.max_abs_mm() - max_mm).abs() > 1e-9 {
+            return Err(broken(format!("largest value is {} mm, the header says {max_mm}", map.max_abs_mm())));
         }
         Ok(map)
     }

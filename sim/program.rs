@@ -172,13 +172,13 @@ impl Program {
     /// Returns the reason if this machine cannot execute the program, for example because the program turns an axis
     /// that the machine does not have, or turns the head beyond its range.
     pub fn with_head(mut self, head: Option<Head>) -> Result<Self, String> {
-        let why = match (self.axis, head) {
+        let reason = match (self.axis, head) {
             (Some(letter), None) => Some(format!("the program turns {letter}, and this machine has no rotary axis")),
             (_, Some(head)) => head.refusal_reason(&self),
             (None, None) => None,
         };
         self.head = head;
-        why.map_or(Ok(self), Err)
+        reason.map_or(Ok(self), Err)
     }
 
     /// Returns the position in mm of the wheel's centre during the move from `from` to `to`. `share` is the completed
@@ -227,7 +227,7 @@ impl Control {
         let mut reader = Reader { control: self, ..Reader::default() };
         reader.program.by_kinematics = self == Self::Linuxcnc;
         for (k, line) in text.lines().enumerate() {
-            reader.line(line.trim_end_matches('\r')).map_err(|why| format!("line {}: {why}: {line:?}", k + 1))?;
+            reader.line(line.trim_end_matches('\r')).map_err(|reason| format!("line {}: {reason}: {line:?}", k + 1))?;
         }
         reader.finish()
     }
@@ -423,8 +423,8 @@ impl Reader {
             (!self.no_offset, "its work offset is cancelled and not set again"),
             (self.exact, "it moves before it sets the path mode, or in a mode that rounds corners without a limit"),
         ];
-        if let Some((_, why)) = told.iter().find(|(is_so, _)| !is_so) {
-            return Err((*why).to_owned());
+        if let Some((_, reason)) = told.iter().find(|(is_so, _)| !is_so) {
+            return Err((*reason).to_owned());
         }
         let feed = match self.motion {
             Some(0) => None,
@@ -725,7 +725,7 @@ mod tests {
     #[test]
     fn arc_geometry_in_each_control() {
         for (control, text) in ARCS {
-            let program = control.read(text).unwrap_or_else(|why| panic!("{control:?}: {why}"));
+            let program = control.read(text).unwrap_or_else(|reason| panic!("{control:?}: {reason}"));
             let rises = if control == Control::Heidenhain { 0.0 } else { 0.5 };
             let [from, arc, line] = program.waypoints[..] else { panic!("{control:?}: {program:?}") };
             assert_eq!((from.at_mm, arc.at_mm), ([3.0, 1.0, 9.0], [3.0, 1.0 + rises, 5.0]));

@@ -1,7 +1,8 @@
 //! Machine as a Modbus client sees it: blocks of registers to read and to write, and time that passes.
 //!
-//! [`SimulatedMachine`] is the whole simulated machine without its wire. Every answer depends only on what was read, written and
-//! ticked, so a test simulates hours in a moment and is repeatable. Real time enters only through [`SimulatedMachine::tick`].
+//! [`SimulatedMachine`] is the whole simulated machine without its wire. Every answer depends only on what was read,
+//! written and ticked, so a test simulates hours in a moment and is repeatable. Real time enters only through
+//! [`SimulatedMachine::tick`].
 
 use std::time::Duration;
 

@@ -1,5 +1,5 @@
-//! Regrind closes the loop of a precision grinding cell: a free-form part is ground, measured, registered to the offset of
-//! its nominal surface, corrected and ground again until it is accepted.
+//! Regrind closes the loop of a precision grinding cell: a free-form part is ground, measured, registered to the offset
+//! of its nominal surface, corrected and ground again until it is accepted.
 //!
 //! A pure state machine decides, thin drivers act, a pure numerical core computes, and one journal records every event.
 //!

@@ -507,8 +507,8 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     let feed = recipe.grinding.feed_mm_min;
     beyond("grinding.feed_mm_min", feed, 0.0, limits.max_feed_mm_min, "grinder.limits.max_feed_mm_min")?;
     // Each value keeps its own unit in the message: micrometres in the recipe, millimetres in the cell file.
-    let (depth_um, most_um) = (recipe.compensation.depth_of_cut_um.0, 1e3 * limits.max_depth_mm);
-    beyond("compensation.depth_of_cut_um", depth_um, 0.0, most_um, "1000 times grinder.limits.max_depth_mm")?;
+    let (depth_um, max_um) = (recipe.compensation.depth_of_cut_um.0, 1e3 * limits.max_depth_mm);
+    beyond("compensation.depth_of_cut_um", depth_um, 0.0, max_um, "1000 times grinder.limits.max_depth_mm")?;
     if targets.is_empty() && !cell.cmm.link.wire.is_by_person() {
         return Err(SetupError::NeedsPlan { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() });
     }
@@ -625,7 +625,7 @@ fn track_distance(
     let widest_mm = grinding.wheel.radius_mm().min(0.5 * size_mm[0].min(size_mm[1]));
     let track_mm = match (grinding.track_mm, grinding.scallop_nm) {
         (Some(track_mm), None) => track_mm,
-        (most_mm, Some(nm)) => unit.max_track_mm(1e-6 * nm, f64::INFINITY).min(most_mm.unwrap_or(widest_mm)),
+        (max_mm, Some(nm)) => unit.max_track_mm(1e-6 * nm, f64::INFINITY).min(max_mm.unwrap_or(widest_mm)),
         (None, None) => track_for_tolerance_mm(recipe, &unit).min(widest_mm),
     };
     Ok((track_mm, Some(unit.with_track_mm(track_mm))))
@@ -639,12 +639,12 @@ fn track_distance(
 /// scallops.
 pub fn track_for_tolerance_mm(recipe: &Recipe, scallops: &Scallops) -> f64 {
     let share = |limit: Option<Micrometres>| limit.map_or(f64::INFINITY, |um| MAX_SCALLOP_SHARE * um.mm());
-    let most_mm = scallops.max_track_mm(share(recipe.acceptance.pv_um), share(recipe.acceptance.rms_um));
-    if !most_mm.is_finite() {
-        return most_mm;
+    let max_mm = scallops.max_track_mm(share(recipe.acceptance.pv_um), share(recipe.acceptance.rms_um));
+    if !max_mm.is_finite() {
+        return max_mm;
     }
-    let per_mm = 10f64.powf(1.0 - most_mm.log10().floor());
-    (most_mm * per_mm).floor() / per_mm
+    let per_mm = 10f64.powf(1.0 - max_mm.log10().floor());
+    (max_mm * per_mm).floor() / per_mm
 }
 
 /// Returns the settings that all grinding programs of a part have in common, such as path options, machine limits and
@@ -817,9 +817,7 @@ pub fn create_drivers(
         cell_folder: cell.path().parent().unwrap_or(Path::new("")),
         run_folder: folder,
         min_free_points: match &recipe.pattern {
-            MeasuringPattern::Free { min_points: least_points } => {
-                Some(usize::try_from(*least_points).unwrap_or(usize::MAX))
-            }
+            MeasuringPattern::Free { min_points } => Some(usize::try_from(*min_points).unwrap_or(usize::MAX)),
             _ => None,
         },
         min_coverage: min_found_share(recipe),

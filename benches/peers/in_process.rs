@@ -1,7 +1,7 @@
 //! The clock for `compare.py`: the same files as the peers read, the time without reading them.
 //!
-//! Arguments: nominal file, measured file, probe radius in mm, `identity` or `search`, repeats. Prints one line of JSON with the
-//! median times in seconds. Without arguments, as under a plain `cargo bench`, it does nothing.
+//! Arguments: nominal file, measured file, probe radius in mm, `identity` or `search`, repeats. Prints one line of JSON
+//! with the median times in seconds. Without arguments, as under a plain `cargo bench`, it does nothing.
 
 use std::error::Error;
 use std::time::{Duration, Instant};

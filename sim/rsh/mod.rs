@@ -510,9 +510,9 @@ impl Controller {
                     }
                     left_s -= way_mm / mm_s;
                 }
-                Step::Refused { reason: why, line } => {
+                Step::Refused { reason, line } => {
                     self.line = line;
-                    self.errors.push_back(why);
+                    self.errors.push_back(reason);
                     return self.break_off();
                 }
                 Step::Wait { line } => {

@@ -166,7 +166,7 @@ impl Program {
                     let chords = stop.in_chords(self.at_mm, CHORDS_MM);
                     steps.extend(chords.into_iter().map(|to_mm| Step::Move { to_mm, mm_s, line }));
                 }
-                Err(why) => steps.push_back(Step::Refused { reason: why, line }),
+                Err(reason) => steps.push_back(Step::Refused { reason, line }),
             }
             self.at_mm = to_mm;
         }

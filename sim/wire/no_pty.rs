@@ -17,8 +17,8 @@ impl Pty {
     /// # Errors
     /// Always.
     pub fn open() -> io::Result<Self> {
-        let why = "this system has no pseudo-terminals; let the simulated machine speak Modbus TCP";
-        Err(io::Error::new(io::ErrorKind::Unsupported, why))
+        let reason = "this system has no pseudo-terminals; let the simulated machine speak Modbus TCP";
+        Err(io::Error::new(io::ErrorKind::Unsupported, reason))
     }
 
     /// Returns the path of the pseudo-terminal that a client opens.

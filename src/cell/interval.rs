@@ -14,8 +14,8 @@ pub struct RecordedInterval {
     /// Quantile at 97.5 %.
     #[serde(with = "super::number")]
     pub high_mm: f64,
-    /// Quantiles at [`RecordedInterval::PROBABILITIES`]. `None` if the figure is treated as normal, and in records of earlier
-    /// versions.
+    /// Quantiles at [`RecordedInterval::PROBABILITIES`]. `None` if the figure is treated as normal, and in records of
+    /// earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub quantiles_mm: Option<[f64; RecordedInterval::COUNT]>,
 }

@@ -39,17 +39,18 @@ impl Figures {
 
     /// Returns two results: the credible intervals of the figures that are judged, and a flag.
     ///
-    /// The first interval belongs to the peak to valley (PV), and the second one to the root mean square (RMS). `pv_of`
-    /// selects the PV: PV 99.8 % or the PV of all points. If no PV 99.8 % was computed, the PV of all points is used.
+    /// The first interval belongs to the peak to valley (PV), and the second one to the root mean square (RMS).
+    /// `pv_points` selects the PV: PV 99.8 % or the PV of all points. If no PV 99.8 % was computed, the PV of all
+    /// points is used.
     ///
     /// The flag is true if the first interval belongs to the PV 99.8 %, and false if it belongs to the PV of all
     /// points.
-    fn judged_intervals(&self, pv_of: PvPoints) -> ([RecordedInterval; 2], bool) {
+    fn judged_intervals(&self, pv_points: PvPoints) -> ([RecordedInterval; 2], bool) {
         match &self.form {
-            Some(form) if pv_of == PvPoints::MostPoints => ([form.pv_998, form.rms], true),
+            Some(form) if pv_points == PvPoints::MostPoints => ([form.pv_998, form.rms], true),
             Some(form) => ([form.pv, form.rms], false),
             None => {
-                let robust = self.pv_998_mm.filter(|_| pv_of == PvPoints::MostPoints);
+                let robust = self.pv_998_mm.filter(|_| pv_points == PvPoints::MostPoints);
                 let pv = RecordedInterval::from_expanded(robust.unwrap_or(self.pv_mm), self.pv_expanded_mm);
                 ([pv, RecordedInterval::from_expanded(self.rms_mm, self.rms_expanded_mm)], robust.is_some())
             }
@@ -127,8 +128,8 @@ fn format_percent(probability: f64) -> String {
 
 impl Tolerance {
     /// Compares the peak to valley (PV) and the root mean square (RMS) in `figures` with their limits. Returns one
-    /// result for the PV and one for the RMS, in this order. The field `pv_of` of the tolerance selects the PV: PV 99.8
-    /// % or the PV of all points.
+    /// result for the PV and one for the RMS, in this order. The field `pv_points` of the tolerance selects the PV: PV
+    /// 99.8 % or the PV of all points.
     pub fn compare(&self, figures: &Figures) -> [ComparedFigure; 2] {
         let ([pv, rms], is_robust) = figures.judged_intervals(self.pv_points);
         let compared = |name, of: RecordedInterval, limit_mm: f64| {

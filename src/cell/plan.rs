@@ -92,7 +92,8 @@ pub enum PvPoints {
     /// The points that were touched.
     #[serde(rename = "all")]
     All,
-    /// The aperture: the touched points and the places between them, without the outermost 0.1 % of these at either end.
+    /// The aperture: the touched points and the places between them, without the outermost 0.1 % of these at either
+    /// end.
     #[default]
     #[serde(rename = "99.8 %")]
     MostPoints,
@@ -149,10 +150,10 @@ pub struct Deadlines {
     pub progress_notice: [Option<Duration>; 2],
     /// Maximum duration of a series of failures without progress, from its first failure. After this time the cell is
     /// held.
-    #[serde(rename = "vain", default = "Deadlines::vain")]
+    #[serde(rename = "vain", default = "Deadlines::default_recurring_failure_time")]
     pub recurring_failure_time: Duration,
     /// Number of failures in a row, without progress, after which the cell is held.
-    #[serde(rename = "vain_failures", default = "Deadlines::vain_failures")]
+    #[serde(rename = "vain_failures", default = "Deadlines::default_max_recurring_failures")]
     pub max_recurring_failures: u32,
     /// Time from HOLD to the safe position of each machine: CMM, grinder.
     pub hold: [Duration; 2],
@@ -170,11 +171,11 @@ pub struct Deadlines {
 }
 
 impl Deadlines {
-    fn vain() -> Duration {
+    fn default_recurring_failure_time() -> Duration {
         Duration::from_secs(60)
     }
 
-    fn vain_failures() -> u32 {
+    fn default_max_recurring_failures() -> u32 {
         5
     }
 }
@@ -189,8 +190,8 @@ impl Default for Deadlines {
             answer: s(10),
             progress: [s(60); 2],
             progress_notice: [Some(s(30)); 2],
-            recurring_failure_time: Self::vain(),
-            max_recurring_failures: Self::vain_failures(),
+            recurring_failure_time: Self::default_recurring_failure_time(),
+            max_recurring_failures: Self::default_max_recurring_failures(),
             hold: [s(30); 2],
             stop: [s(60); 2],
             abort: s(2),

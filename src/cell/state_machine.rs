@@ -44,7 +44,7 @@ impl Cell {
         }
         self.now = now;
         let asked = self.state.phase().and_then(Phase::job);
-        let answered = self.foreign_reason(event).map_or_else(|| self.transition(event), |why| Err(Some(why)));
+        let answered = self.foreign_reason(event).map_or_else(|| self.transition(event), |reason| Err(Some(reason)));
         if let (Some((device, JobStep::Start | JobStep::Run | JobStep::Reconcile)), Ok(())) = (asked, &answered) {
             self.job_observed[device as usize] |= shows_job(event, device);
         }

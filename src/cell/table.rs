@@ -287,13 +287,9 @@ fn computation_events(cycle: u32) -> Vec<Event> {
     events.extend(sample_figures().into_iter().map(|figures| Event::Registered { cycle, figures }));
     events.push(Event::RegistrationFailed { cycle, reason: text() });
     events.push(Event::NotSaved { cycle, reason: RecordFailure::DiskFull(text()) });
-    let (largest_mm, depth_mm, predicted_pv_mm) = (0.02, 0.03, 0.005);
-    let summary = CompensationSummary {
-        max_correction_mm: largest_mm,
-        depth_mm,
-        predicted_pv_mm,
-        ..CompensationSummary::default()
-    };
+    let (max_mm, depth_mm, predicted_pv_mm) = (0.02, 0.03, 0.005);
+    let summary =
+        CompensationSummary { max_correction_mm: max_mm, depth_mm, predicted_pv_mm, ..CompensationSummary::default() };
     events.push(Event::Compensated { cycle, summary: summary.clone() });
     let asking = CompensationSummary { confirmations_required: vec![text()], ..summary };
     events.push(Event::Compensated { cycle, summary: asking });

@@ -20,7 +20,8 @@ use State::{
     Suspending, Unholding, Unsuspending,
 };
 
-/// Minimum number of failures in a series before the time limit `vain` of [`Deadlines`] can end the retries.
+/// Minimum number of failures in a series before the time limit
+/// `recurring_failure_time` of [`Deadlines`] can end the retries.
 const MIN_RECURRING_FAILURES: u32 = 3;
 
 // Basic operations, which the other blocks build on.
@@ -68,40 +69,41 @@ impl Cell {
     /// other machine has a series for which it was raised.
     fn reset_failures(&mut self, device: Device) {
         let was_told = std::mem::take(&mut self.failure_series[device as usize]).reported;
-        if was_told && !self.failure_series.iter().any(|vain| vain.reported) {
+        if was_told && !self.failure_series.iter().any(|series| series.reported) {
             self.withdraw(AlarmId::FailsAgain);
         }
     }
 
-    /// Adds a failure at the present time to the [`FailureSeries`] (failures in a row) of the machine `device`. `vain`
-    /// in the deadlines of the plan is the maximum duration of such a series. Begins a new series if the last failure
-    /// was too long ago. This is the case after more than twice `vain`, or after more than half of `vain` if the
-    /// machine is running its job.
+    /// Adds a failure at the present time to the [`FailureSeries`] (failures in a row) of the machine `device`.
+    /// `recurring_failure_time` in the deadlines of the plan is the maximum duration of such a series. Begins a new
+    /// series if the last failure was too long ago. This is the case after more than twice `recurring_failure_time`, or
+    /// after more than half of `recurring_failure_time` if the machine is running its job.
     ///
     /// Returns true if the cell must stop retrying. This is the case if the series has the maximum number of failures,
-    /// `vain_failures`. It is also the case if the series has at least [`MIN_RECURRING_FAILURES`] failures and lasts at
-    /// least `vain`.
+    /// `max_recurring_failures`. It is also the case if the series has at least [`MIN_RECURRING_FAILURES`] failures and
+    /// lasts at least `recurring_failure_time`.
     fn count_failure(&mut self, device: Device) -> bool {
-        let Deadlines { recurring_failure_time: vain, max_recurring_failures: vain_failures, .. } = self.plan.deadlines;
+        let Deadlines { recurring_failure_time, max_recurring_failures, .. } = self.plan.deadlines;
         let now = self.now;
         let in_sight = matches!(self.state, Execute(phase) if phase == Phase::from_job(device, JobStep::Run));
         let FailureSeries { failures, first: since, last, .. } = &mut self.failure_series[device as usize];
         // An old failure has nothing to do with this one. Nor has one after which the job was seen running for a while.
-        let over = if in_sight { vain / 2 } else { vain.saturating_mul(2) };
+        let over = if in_sight { recurring_failure_time / 2 } else { recurring_failure_time.saturating_mul(2) };
         if *failures == 0 || now.saturating_sub(*last) > over {
             (*failures, *since) = (0, now);
         }
         (*failures, *last) = (*failures + 1, now);
-        *failures >= vain_failures || *failures >= MIN_RECURRING_FAILURES && now.saturating_sub(*since) >= vain
+        *failures >= max_recurring_failures
+            || *failures >= MIN_RECURRING_FAILURES && now.saturating_sub(*since) >= recurring_failure_time
     }
 
-    fn raise_recurring_failure(&mut self, device: Device, phase: Phase, why: &str) {
+    fn raise_recurring_failure(&mut self, device: Device, phase: Phase, reason: &str) {
         self.failure_series[device as usize].reported = true;
         let FailureSeries { failures, first: since, .. } = self.failure_series[device as usize];
         let seconds = self.now.saturating_sub(since).as_secs();
         self.raise(
             AlarmId::FailsAgain,
-            &format!("{device}, {phase}, {failures} failures in {seconds} s, last reason: {why}"),
+            &format!("{device}, {phase}, {failures} failures in {seconds} s, last reason: {reason}"),
         );
     }
 
@@ -237,8 +239,8 @@ impl Cell {
         }
     }
 
-    pub(super) fn on_not_connected(&mut self, device: Device, why: &ConnectionRefusal) {
-        let (id, message) = match why {
+    pub(super) fn on_not_connected(&mut self, device: Device, reason: &ConnectionRefusal) {
+        let (id, message) = match reason {
             ConnectionRefusal::Unreachable(message) => (AlarmId::Unreachable, message.as_str()),
             ConnectionRefusal::WrongDevice(message) => (AlarmId::WrongDevice, message.as_str()),
             ConnectionRefusal::WordOrder(message) => (AlarmId::WordOrder, message.as_str()),
@@ -403,11 +405,11 @@ impl Cell {
         self.pass_count = self.pass_count.saturating_sub(u32::from(device == Device::Grinder));
     }
 
-    pub(super) fn on_refused(&mut self, phase: Phase, device: Device, what: MachineRequest, why: &str) {
+    pub(super) fn on_refused(&mut self, phase: Phase, device: Device, what: MachineRequest, reason: &str) {
         if what == MachineRequest::Start {
             self.uncount_pass(device);
         }
-        self.raise(AlarmId::MachineRefused, &format!("{device}, {what}: {why}"));
+        self.raise(AlarmId::MachineRefused, &format!("{device}, {what}: {reason}"));
         self.acknowledge_refused[device as usize] = what == MachineRequest::Acknowledge;
         // The machine still has the job that a person declared over: ask it once more.
         let still_there = what == MachineRequest::Discard && phase == Phase::from_job(device, JobStep::Discard);
@@ -484,7 +486,7 @@ impl Cell {
     pub(super) fn on_collected(&mut self, targets: u32, found: u32, gate: &GateResult) {
         let share = f64::from(found) / f64::from(targets.max(1));
         let gate = match gate {
-            GateResult::Failed(why) => Some(gate_alarm(why)),
+            GateResult::Failed(reason) => Some(gate_alarm(reason)),
             GateResult::Passed if found > targets || share < self.plan.gates.min_found_share => {
                 let least = 100.0 * self.plan.gates.min_found_share;
                 Some((
@@ -538,8 +540,8 @@ impl Cell {
                 &format!("{found:.0} % of the aperture is covered, at least {least:.0} % is required"),
             );
         } else if shift > gates.max_shift_mm || figures.rotation_rad > gates.max_rotation_rad {
-            let (most, most_turn) = (gates.max_shift_mm, gates.max_rotation_rad.to_degrees());
-            let case = format!("shift {shift:.3} mm, limit {most:.3} mm; turn {turn:.2}°, limit {most_turn:.2}°");
+            let (most, max_turn) = (gates.max_shift_mm, gates.max_rotation_rad.to_degrees());
+            let case = format!("shift {shift:.3} mm, limit {most:.3} mm; turn {turn:.2}°, limit {max_turn:.2}°");
             self.reject_measurement(AlarmId::PartMisplaced, &case);
         } else if figures.further_touches.is_some() {
             // More points of the same measurement follow. A partial measurement is not judged.
@@ -627,8 +629,8 @@ impl Cell {
         }
     }
 
-    pub(super) fn on_compensation_refused(&mut self, why: &CompensationRefusal) {
-        match why {
+    pub(super) fn on_compensation_refused(&mut self, refusal: &CompensationRefusal) {
+        match refusal {
             CompensationRefusal::BudgetSpent(message) => {
                 let (cycle, verdict, reason) = (self.cycle, Verdict::BudgetSpent, message.clone());
                 self.push(Command::Announce(Judgement { cycle, verdict, reason }));
@@ -782,10 +784,10 @@ impl Cell {
         }
     }
 
-    /// Handles the event that the machine `device` no longer reports its running job. `why` is the reason. Raises an
+    /// Handles the event that the machine `device` no longer reports its running job. `reason` is the reason. Raises an
     /// alarm and asks the machine for the state of the job. The cell draws no conclusion before the answer.
-    pub(super) fn on_job_vanished(&mut self, device: Device, why: &str) {
-        self.raise(AlarmId::JobVanished, &format!("{device}, {why}"));
+    pub(super) fn on_job_vanished(&mut self, device: Device, reason: &str) {
+        self.raise(AlarmId::JobVanished, &format!("{device}, {reason}"));
         let asked = Phase::from_job(device, JobStep::Reconcile);
         self.enter_state(match self.state {
             Execute(_) | Unholding(_) | Unsuspending(_) => Execute(asked),
@@ -898,15 +900,15 @@ impl Cell {
         }
     }
 
-    /// Handles the loss of the link to the machine `device`. `why` is the reason. `phase` is the present phase of the
-    /// cell.
+    /// Handles the loss of the link to the machine `device`. `reason` is the reason. `phase` is the present phase of
+    /// the cell.
     ///
     /// If `phase` needs this machine, the cell enters the state `wait` (held or suspended), with the phase from which
     /// it can restart. If the link fails too often, the cell is held in any case. While the cell is being held and this
     /// machine may move, the cell stays holding until the machine confirms that it is at rest.
     ///
     /// If `phase` does not need this machine, the cell continues.
-    pub(super) fn on_link_lost(&mut self, phase: Phase, device: Device, why: &str, wait: fn(Phase) -> State) {
+    pub(super) fn on_link_lost(&mut self, phase: Phase, device: Device, reason: &str, wait: fn(Phase) -> State) {
         self.set_link_lost(device, true);
         let needed = phase.job().map(|(job, _)| job) == Some(device) || device_awaited_clear(phase) == Some(device);
         let fails_again = self.count_failure(device);
@@ -916,9 +918,9 @@ impl Cell {
         let was_told = self.failure_series[device as usize].reported
             && (!needed || self.active_alarms.contains_key(&AlarmId::FailsAgain));
         if !(fails_again && was_told) {
-            self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
+            self.raise(AlarmId::LinkLost, &format!("{device}, {reason}"));
             if is_vain {
-                self.raise_recurring_failure(device, phase, why);
+                self.raise_recurring_failure(device, phase, reason);
             }
             self.failure_series[device as usize].reported = fails_again;
         }
@@ -937,15 +939,15 @@ impl Cell {
         }
     }
 
-    /// Handles the failure of a station: the task of this program that communicates with the machine `device`. `why` is
-    /// the reason. A station does not recover by itself, so the cell raises an alarm and waits for a person.
+    /// Handles the failure of a station: the task of this program that communicates with the machine `device`. `reason`
+    /// is the reason. A station does not recover by itself, so the cell raises an alarm and waits for a person.
     ///
     /// If the cell is starting, the run is stopped. If the present phase needs this machine, the cell becomes held at
     /// once. Otherwise an executing cell is held after the present phase. If the other machine runs its job, the cell
     /// orders it to hold.
-    pub(super) fn on_station_failed(&mut self, device: Device, why: &str) {
+    pub(super) fn on_station_failed(&mut self, device: Device, reason: &str) {
         self.set_link_lost(device, true);
-        let case = format!("{device}, {why}");
+        let case = format!("{device}, {reason}");
         self.raise(AlarmId::ProgramFailed, &case);
         match self.state {
             Starting => self.stop(&case, false),
@@ -1007,16 +1009,16 @@ impl Cell {
         self.unsuspend_if_possible();
     }
 
-    pub(super) fn raise_record_failed(&mut self, why: &RecordFailure) {
-        let (id, message) = match why {
+    pub(super) fn raise_record_failed(&mut self, reason: &RecordFailure) {
+        let (id, message) = match reason {
             RecordFailure::DiskFull(message) => (AlarmId::DiskFull, message),
             RecordFailure::Unwritable(message) => (AlarmId::JournalUnwritable, message),
         };
         self.raise(id, message);
     }
 
-    pub(super) fn on_record_failed(&mut self, why: &RecordFailure) {
-        self.raise_record_failed(why);
+    pub(super) fn on_record_failed(&mut self, reason: &RecordFailure) {
+        self.raise_record_failed(reason);
         match self.state {
             Execute(phase) | Unholding(phase) | Unsuspending(phase) => self.hold(phase),
             Suspending(phase) => self.enter_state(Holding(phase)),
@@ -1452,8 +1454,8 @@ pub(super) fn reason_clause(reason: &str) -> String {
     if reason.is_empty() { String::new() } else { format!(", because {reason}") }
 }
 
-fn gate_alarm(why: &GateFailure) -> (AlarmId, String) {
-    match why {
+fn gate_alarm(reason: &GateFailure) -> (AlarmId, String) {
+    match reason {
         GateFailure::Coverage(message) => (AlarmId::Coverage, message.clone()),
         GateFailure::NoPart => (AlarmId::NoPart, String::new()),
         GateFailure::Contacts => (AlarmId::Contacts, String::new()),

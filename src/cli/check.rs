@@ -8,7 +8,7 @@ use annotate_snippets::renderer::DecorStyle;
 use annotate_snippets::{AnnotationKind, Level, Origin, Renderer, Snippet};
 use clap::Args;
 use console::Term;
-use regrind::config::{CellConfig, read_dialect};
+use regrind::config::{CellConfig, DialectFile, read_dialect};
 use regrind::document::{Problem, Problems};
 use regrind::recipe::{MeasuringPattern, NominalSource, Recipe};
 use regrind::setup::{nominal_table_format, plan_table_format};
@@ -106,7 +106,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 /// result is the SHA-256 hash of the file with notes for people, or all problems of the file.
 fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     if has_table(path, &["[dialect]"]) {
-        let good = |(_, sha256): (_, [u8; 32])| Good { sha256: hex(&sha256), notes: Vec::new() };
+        let good = |file: DialectFile| Good { sha256: hex(&file.source_sha256), notes: file.renamed_keys };
         return ("dialect", read_dialect(path).map(good));
     }
     if has_table(path, &["[cell]", "[cmm", "[[cmm", "[grinder]", "[grinder.", "[[grinder"]) {

@@ -80,7 +80,7 @@ impl Finding {
     fn from_result<E: std::fmt::Display>(what: &str, looked: Result<String, E>) -> Self {
         match looked {
             Ok(words) => Self::new(what, FindingLevel::Good, words),
-            Err(why) => Self::new(what, FindingLevel::Obstacle, why.to_string()),
+            Err(reason) => Self::new(what, FindingLevel::Obstacle, reason.to_string()),
         }
     }
 }

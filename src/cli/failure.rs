@@ -137,8 +137,8 @@ pub(super) enum Failure {
     #[error(transparent)]
     Users(#[from] regrind_page::UsersError),
     #[cfg(feature = "plant")]
-    #[error("{why}")]
-    OpenWork { why: String },
+    #[error("{reason}")]
+    OpenWork { reason: String },
     #[cfg(feature = "plant")]
     #[error(
         "{}: this file cannot be read: {source}; check that the file exists, and that you have the right to read the file",

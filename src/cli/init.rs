@@ -168,7 +168,7 @@ fn ask<T>(question: &str, usual: &str, read: impl Fn(&str) -> Result<T, String>)
         let given = line.trim();
         match read(if given.is_empty() { usual } else { given }) {
             Ok(answer) => return Ok(answer),
-            Err(why) => super::print(&format!("{given:?}: {why}\n"))?,
+            Err(reason) => super::print(&format!("{given:?}: {reason}\n"))?,
         }
     }
 }

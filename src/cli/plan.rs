@@ -124,7 +124,7 @@ struct ArcsDocument {
 
 impl ArcsDocument {
     fn new(arcs: &ArcSummary, summary: &PathSummary, within_mm: f64) -> Self {
-        let [largest_corner_mrad, lines_alone_corner_mrad] = arcs.corner_rad.map(|rad| 1e3 * rad);
+        let [max_corner_mrad, lines_alone_corner_mrad] = arcs.corner_rad.map(|rad| 1e3 * rad);
         Self {
             arcs: arcs.arcs,
             lines: arcs.lines,
@@ -132,7 +132,7 @@ impl ArcsDocument {
             lines_alone_per_second: summary.points as f64 / summary.duration_s,
             max_deviation_um: 1e3 * arcs.deviation_mm,
             within_um: 1e3 * within_mm,
-            max_corner_mrad: largest_corner_mrad,
+            max_corner_mrad,
             lines_alone_corner_mrad,
         }
     }
@@ -278,10 +278,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let first_um = 1e3 * task.correction_limits.allowance_mm;
     let grinding_minutes = path_mm / task.pass.feed_mm_min;
     let removed_mm3_a_pass = pass_mm * task.pass.track_spacing_mm * task.correction_limits.depth_of_cut_mm;
-    let most_measurements = plan.max_cycles + u32::from(plan.begin_with == FirstStep::Measure);
-    let least_measuring_minutes = min_measuring_minutes(&task);
-    let least_minutes = f64::from(plan.max_cycles) * grinding_minutes
-        + f64::from(most_measurements) * least_measuring_minutes.unwrap_or(0.0);
+    let max_measurements = plan.max_cycles + u32::from(plan.begin_with == FirstStep::Measure);
+    let min_measuring_minutes = min_measuring_minutes(&task);
+    let min_minutes = f64::from(plan.max_cycles) * grinding_minutes
+        + f64::from(max_measurements) * min_measuring_minutes.unwrap_or(0.0);
     let document = Document {
         simulation: cell.simulated,
         part: recipe.part.name.clone(),
@@ -303,10 +303,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         removed_mm3_a_pass,
         wheel_loss_mm3_a_pass: recipe.grinding.grinding_ratio.map(|ratio| removed_mm3_a_pass / ratio),
         max_passes: plan.max_cycles,
-        max_measurements: most_measurements,
-        min_measuring_minutes: least_measuring_minutes,
-        min_hours_total: least_minutes / 60.0,
-        warnings: warnings(&task, path_mm, grinding_minutes, least_measuring_minutes)
+        max_measurements,
+        min_measuring_minutes,
+        min_hours_total: min_minutes / 60.0,
+        warnings: warnings(&task, path_mm, grinding_minutes, min_measuring_minutes)
             .into_iter()
             .chain(warning_of_scallops(&task, &recipe))
             .collect(),
@@ -440,7 +440,7 @@ fn words(d: &Document) -> String {
     let marked = if d.simulation { "SIMULATION  " } else { "" };
     let program = match (d.program_points, &d.no_program) {
         (Some(points), _) => format!("{} a pass, for {}", counted(points as usize, "point"), d.dialect),
-        (None, why) => format!("none: {}", why.as_deref().unwrap_or_default()),
+        (None, reason) => format!("none: {}", reason.as_deref().unwrap_or_default()),
     };
     let arcs = d.arcs.as_ref().zip(d.program_points);
     let arcs = arcs.map_or(String::new(), |(arcs, points)| format!("arcs        {}\n", arcs.in_words(points)));

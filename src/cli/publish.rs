@@ -232,10 +232,10 @@ async fn print_events(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, j
                 PublisherEvent::Connected { place } => {
                     say(json, &json!({ "tells": place }), &format!("publishing to {place}"))
                 }
-                PublisherEvent::Retrying { place, why } => say(
+                PublisherEvent::Retrying { place, reason } => say(
                     json,
-                    &json!({ "waits": place, "why": why }),
-                    &format!("not publishing to {place}: {why}; the cell continues, and this program tries again"),
+                    &json!({ "waits": place, "why": reason }),
+                    &format!("not publishing to {place}: {reason}; the cell continues, and this program tries again"),
                 ),
                 PublisherEvent::Refused { by, what } if quota.takes(Instant::now()) => {
                     refuse(&runs, json, &by, &what).await

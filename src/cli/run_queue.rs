@@ -240,11 +240,11 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
             // The end of the run is still on its way to the plant.
             RunProgress::Over => continue,
             RunProgress::UnderWay => {
-                let why = format!(
+                let reason = format!(
                     "run {run} of {serial} is not over: regrind resume {} continues the run; if resume is refused, give up the part: regrind work --give-up {serial} --reason \"...\"",
                     folder.display()
                 );
-                return Err(Failure::OpenWork { why });
+                return Err(Failure::OpenWork { reason });
             }
             RunProgress::Nowhere => {
                 format!(
@@ -254,8 +254,8 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
             }
             RunProgress::Begun => "which sent no request to a machine; return the part to the queue".to_owned(),
         };
-        let why = format!("{serial} was begun in run {run}, {nothing}: regrind work --give-back {serial}");
-        return Err(Failure::OpenWork { why });
+        let reason = format!("{serial} was begun in run {run}, {nothing}: regrind work --give-back {serial}");
+        return Err(Failure::OpenWork { reason });
     }
     Ok(())
 }
@@ -274,12 +274,12 @@ async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>)
         return Ok(Outcome::NotInTolerance);
     };
     let (run, folder) = (&begun.run, runs.join(&begun.run));
-    let refused = |why: String| Err(Failure::OpenWork { why });
+    let refused = |reason: String| Err(Failure::OpenWork { reason });
     if is_live(&folder) {
         return refused(format!("run {run} of {serial} is active; end the run first with regrind stop"));
     }
-    if let Some(why) = up {
-        begun.give_up(&link, why).await?;
+    if let Some(reason) = up {
+        begun.give_up(&link, reason).await?;
         super::print(&format!(
             "the part {serial} is given up; to make the part again, a planner must queue the part again\n"
         ))?;

@@ -51,14 +51,14 @@ pub(super) fn judged(compared: &ComparedFigure) -> String {
 ///
 /// The maximum selects the unit: s below 90 s, min below 90 min, otherwise h with one decimal. If minimum and maximum
 /// are equal after rounding, returns one number: "50 s".
-pub(super) fn time_left([least_s, most_s]: [f64; 2]) -> String {
-    let (unit, name) = match most_s {
+pub(super) fn time_left([min_s, max_s]: [f64; 2]) -> String {
+    let (unit, name) = match max_s {
         s if s < 90.0 => (1.0, "s"),
         s if s < 5400.0 => (60.0, "min"),
         _ => (3600.0, "h"),
     };
     let digits = usize::from(name == "h");
-    let [least, most] = [least_s, most_s].map(|s| format!("{:.digits$}", s / unit));
+    let [least, most] = [min_s, max_s].map(|s| format!("{:.digits$}", s / unit));
     if least == most { format!("{most} {name}") } else { format!("{least} to {most} {name}") }
 }
 

@@ -31,14 +31,16 @@ impl CheckedCell {
     /// content. `renamed` contains one note for each key that the file has under its old name.
     ///
     /// Returns `None` if a required value is missing or invalid.
-    pub(super) fn into_cell(self, path: &Path, text: &str, renamed: Vec<String>) -> Option<CellConfig> {
+    pub(super) fn into_cell(self, path: &Path, text: &str, mut renamed: Vec<String>) -> Option<CellConfig> {
+        let grinder = self.grinder?;
+        renamed.extend_from_slice(&grinder.program.dialect_renamed_keys);
         Some(CellConfig {
             name: self.name?,
             simulated: self.simulated?,
             rehearsal: false,
             require_signature: self.require_signature,
             cmm: self.cmm?,
-            grinder: self.grinder?,
+            grinder,
             path: path.to_owned(),
             text: text.to_owned(),
             source_sha256: sha256(text),
@@ -206,8 +208,8 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
             document.report("grinder.program.folder", found, "the folder is grinder.wire.programs", "remove it");
         }
     }
-    let dialect = match dialect::read_named_dialect(&written.dialect, path) {
-        Ok(dialect) => dialect,
+    let dialect::DialectFile { dialect, renamed_keys, .. } = match dialect::read_named_dialect(&written.dialect, path) {
+        Ok(file) => file,
         Err(problems) => {
             let known = dialect::dialects().collect::<Vec<_>>().join(", ");
             let file = dialect::dialect_path(&written.dialect, path).unwrap_or_default();
@@ -230,19 +232,21 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
             "arcs require [arcs] in the dialect",
             "remove this key, or add the table [arcs] to a dialect file of your own",
         ),
-        Some(Err(DialectError::ArcsFine { dialect, found_um, decimals, least_um })) => document.report(
+        Some(Err(DialectError::ArcsFine { dialect, found_um, decimals, min_um })) => document.report(
             "grinder.program.arcs_within_um",
             format!("is {found_um} µm"),
             &format!(
-                "it must be at least {least_um:.4} µm, the rounding error of the {decimals} decimals of `{dialect}`"
+                "it must be at least {min_um:.4} µm, the rounding error of the {decimals} decimals of `{dialect}`"
             ),
             "raise arcs_within_um; or, if the control reads more decimals, write a dialect of your own with more \
              decimals",
         ),
         _ => {}
     }
+    let in_file = |note| format!("dialect {}, {note}", written.dialect);
     Some(ProgramConfig {
         dialect,
+        dialect_renamed_keys: renamed_keys.into_iter().map(in_file).collect(),
         arcs_within_mm,
         controller_tolerance_mm: written.controller_tolerance_um.map(|um| 1e-3 * um),
         folder: written.folder.as_ref().map(|folder| path.parent().unwrap_or(Path::new("")).join(folder)),
@@ -283,10 +287,10 @@ fn reference_sphere(
 }
 
 fn travel(written: &TravelTable, machine: &str, document: &mut Document) -> Option<TravelLimits> {
-    let (least_mm, most_mm) = (written.min_mm?, written.max_mm?);
+    let (min_mm, max_mm) = (written.min_mm?, written.max_mm?);
     for (k, axis) in ["x", "y", "z"].into_iter().enumerate() {
-        if least_mm[k] >= most_mm[k] {
-            let found = format!("is {} mm in {axis}, but `max_mm` is only {} mm", least_mm[k], most_mm[k]);
+        if min_mm[k] >= max_mm[k] {
+            let found = format!("is {} mm in {axis}, but `max_mm` is only {} mm", min_mm[k], max_mm[k]);
             document.report(
                 &format!("{machine}.travel.min_mm"),
                 found,
@@ -295,7 +299,7 @@ fn travel(written: &TravelTable, machine: &str, document: &mut Document) -> Opti
             );
         }
     }
-    Some(TravelLimits { min_mm: least_mm, max_mm: most_mm })
+    Some(TravelLimits { min_mm, max_mm })
 }
 
 fn rotary(written: &RotaryTable, document: &mut Document) -> Option<RotaryConfig> {

@@ -3,8 +3,26 @@
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
-use crate::document::{Document, Problems, read_text, schema_of, sha256};
+use crate::document::{Document, Problems, RenamedKey, read_text, schema_of, sha256};
 use crate::formats::gcode::Dialect;
+
+/// Keys that have a new name since version 0.2.
+const RENAMED: &[RenamedKey] = &[
+    RenamedKey { old: "text.longest_line", new: "text.max_line_length" },
+    RenamedKey { old: "numbers.largest_mm", new: "numbers.max_mm" },
+    RenamedKey { old: "program.longest_name", new: "program.max_name_length" },
+];
+
+/// Dialect with the state of its file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DialectFile {
+    /// Program format of the machine control.
+    pub dialect: Dialect,
+    /// SHA-256 of the text of the file.
+    pub source_sha256: [u8; 32],
+    /// One note for each key that the file has under its old name. The note states the line and the new name.
+    pub renamed_keys: Vec<String>,
+}
 
 static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<Dialect>);
 
@@ -42,30 +60,30 @@ pub(super) fn dialect_path(dialect: &str, cell: &Path) -> Option<PathBuf> {
 ///
 /// # Errors
 /// Returns an error if the file cannot be read. Otherwise returns all errors found in its text.
-pub(super) fn read_named_dialect(dialect: &str, cell: &Path) -> Result<Dialect, Problems> {
+pub(super) fn read_named_dialect(dialect: &str, cell: &Path) -> Result<DialectFile, Problems> {
     match BUILT_IN_DIALECTS.iter().find(|(name, _)| *name == dialect) {
-        Some((name, text)) => parse_dialect(Path::new(name), text).map(|(dialect, _)| dialect),
-        None => read_dialect(&dialect_path(dialect, cell).unwrap_or_default()).map(|(dialect, _)| dialect),
+        Some((name, text)) => parse_dialect(Path::new(name), text),
+        None => read_dialect(&dialect_path(dialect, cell).unwrap_or_default()),
     }
 }
 
-/// Reads a dialect file. A dialect is the program format of a machine control. Returns the dialect and the SHA-256 of
-/// the text of the file.
+/// Reads a dialect file. A dialect is the program format of a machine control.
 ///
 /// # Errors
 /// Returns an error if the file cannot be read. Otherwise returns all errors found in its text.
-pub fn read_dialect(path: &Path) -> Result<(Dialect, [u8; 32]), Problems> {
+pub fn read_dialect(path: &Path) -> Result<DialectFile, Problems> {
     let text = read_text(path)?;
     parse_dialect(path, &text)
 }
 
-/// Parses a dialect (the program format of a machine control) from the content `text` of its file. Returns the dialect
-/// and the SHA-256 of `text`. `path` is the path of the file and appears only in error messages.
+/// Parses a dialect (the program format of a machine control) from the content `text` of its file. `path` is the path
+/// of the file and appears only in error messages.
 ///
 /// # Errors
 /// Returns all errors found in the text.
-pub fn parse_dialect(path: &Path, text: &str) -> Result<(Dialect, [u8; 32]), Problems> {
+pub fn parse_dialect(path: &Path, text: &str) -> Result<DialectFile, Problems> {
     let mut document = Document::parse(path, text)?;
+    let renamed_keys = document.rename_keys(RENAMED);
     document.check_schema(&SCHEMA);
     let written: Option<Dialect> = document.deserialize();
     for fault in written.iter().flat_map(Dialect::faults) {
@@ -77,7 +95,7 @@ pub fn parse_dialect(path: &Path, text: &str) -> Result<(Dialect, [u8; 32]), Pro
     document.finish()?;
     let missing =
         || Problems::whole(path, text, "a required value is missing".into(), "compare it with a shipped dialect");
-    Ok((written.ok_or_else(missing)?, sha256(text)))
+    Ok(DialectFile { dialect: written.ok_or_else(missing)?, source_sha256: sha256(text), renamed_keys })
 }
 
 #[cfg(test)]
@@ -89,7 +107,24 @@ mod tests {
         for name in dialects() {
             let dialect =
                 read_named_dialect(name, Path::new("cell.toml")).unwrap_or_else(|problems| panic!("{problems}"));
-            assert_eq!(dialect.dialect.name, name);
+            assert_eq!(dialect.dialect.dialect.name, name);
+            assert_eq!(dialect.renamed_keys, [""; 0], "{name}");
+        }
+    }
+
+    #[test]
+    fn old_dialect_keys_are_read_with_notes() {
+        let new = parse_dialect(Path::new("ours.toml"), BUILT_IN_DIALECTS[1].1).unwrap();
+        let text = RENAMED.iter().fold(BUILT_IN_DIALECTS[1].1.to_owned(), |text, key| {
+            let name = |path: &str| format!("\n{} = ", path.split('.').next_back().unwrap());
+            assert!(text.contains(&name(key.new)), "{}", key.new);
+            text.replace(&name(key.new), &name(key.old))
+        });
+        let old = parse_dialect(Path::new("ours.toml"), &text).unwrap();
+        assert_eq!(old.dialect, new.dialect);
+        assert_eq!(old.renamed_keys.len(), RENAMED.len());
+        for (note, key) in old.renamed_keys.iter().zip(RENAMED) {
+            assert!(note.contains(key.old) && note.contains(key.new), "{note}");
         }
     }
 

@@ -21,7 +21,7 @@ use crate::formats::gcode::Dialect;
 use crate::geometry::{Point, Pose};
 use crate::model::MachineUncertainty;
 
-pub use dialect::{dialect_schema, dialects, parse_dialect, read_dialect};
+pub use dialect::{DialectFile, dialect_schema, dialects, parse_dialect, read_dialect};
 #[cfg(feature = "plant")]
 pub use plant::{PlantConfig, plant_schema};
 pub use tables::RotaryLetter;
@@ -82,8 +82,8 @@ pub struct GrinderConfig {
     pub rotary: Option<RotaryConfig>,
 }
 
-/// Rotary axis of a head that tilts the wheel, in units of its own scale. [`crate::compensation::path::RotaryAxis`] is the
-/// same axis in the form that paths use.
+/// Rotary axis of a head that tilts the wheel, in units of its own scale. [`crate::compensation::path::RotaryAxis`] is
+/// the same axis in the form that paths use.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RotaryConfig {
     /// Letter of the axis in programs: A turns about x, B about y.
@@ -104,6 +104,8 @@ pub struct RotaryConfig {
 pub struct ProgramConfig {
     /// Dialect of its control.
     pub dialect: Dialect,
+    /// One note for each key that the dialect file has under its old name.
+    pub dialect_renamed_keys: Vec<String>,
     /// Tolerance with which the control rounds corners by its own setting, if known.
     pub controller_tolerance_mm: Option<f64>,
     /// Maximum distance of an arc from the path. `None` if programs have lines only.

@@ -96,7 +96,8 @@ pub(super) struct GrinderTable {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct ProgramTable {
-    /// The dialect of its control: `linuxcnc`, `fanuc`, `sinumerik`, `heidenhain`, or a file of your own, relative to this file.
+    /// The dialect of its control: `linuxcnc`, `fanuc`, `sinumerik`, `heidenhain`, or a file of your own, relative to
+    /// this file.
     #[schemars(length(min = 1, max = 400))]
     pub dialect: String,
     /// Tolerance with which the control rounds corners by a setting of its own, for dialects that cannot express it.

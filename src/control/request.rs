@@ -22,8 +22,8 @@ pub enum Request {
     Resume {
         #[serde(default)]
         reason: String,
-        /// Number of the state that the person saw, [`Snapshot::number`]. An order that was meant for another state is
-        /// refused.
+        /// Number of the state that the person saw, [`Snapshot::state_number`]. An order that was meant for another
+        /// state is refused.
         #[serde(rename = "seen", default)]
         state_number: Option<u64>,
     },

@@ -198,8 +198,8 @@ async fn restore_if_removed(
             continue;
         };
         if !std::mem::replace(&mut is_lost, true) {
-            let why = made.as_ref().map_or_else(io::Error::to_string, |_| String::new());
-            let _ = tell.send(EndpointChange::Lost(why));
+            let reason = made.as_ref().map_or_else(io::Error::to_string, |_| String::new());
+            let _ = tell.send(EndpointChange::Lost(reason));
         }
         let Some((door, new)) = made.ok().and_then(|door| Some((door.mark()?, door))) else { continue };
         (mark, is_lost) = (door, false);

@@ -108,21 +108,21 @@ pub trait DriverFactory {
         Some(Coordinates::Centres)
     }
 
-    /// Creates the driver of a measuring machine from this table `wire` and the other data in `making`. Sends nothing
+    /// Creates the driver of a measuring machine from this table `wire` and the other data in `context`. Sends nothing
     /// to the machine yet.
     ///
     /// # Errors
     /// Returns an error if this kind of connection has no driver for a measuring machine, if the connection cannot be
     /// opened, if a folder does not exist, if a file cannot be read, or if the cell file lacks a required value.
-    fn create_cmm(&self, making: &DriverContext<'_>) -> Result<Self::Cmm, DriverError>;
+    fn create_cmm(&self, context: &DriverContext<'_>) -> Result<Self::Cmm, DriverError>;
 
-    /// Creates the driver of a grinder from this table `wire` and the other data in `making`. Sends nothing to the
+    /// Creates the driver of a grinder from this table `wire` and the other data in `context`. Sends nothing to the
     /// machine yet.
     ///
     /// # Errors
     /// Returns an error if this kind of connection has no driver for a grinder. Otherwise the errors are those of
     /// [`DriverFactory::create_cmm`].
-    fn create_grinder(&self, making: &DriverContext<'_>) -> Result<Self::Grinder, DriverError>;
+    fn create_grinder(&self, context: &DriverContext<'_>) -> Result<Self::Grinder, DriverError>;
 
     /// Returns the Modbus line that the driver `_cmm` uses. The driver of the other machine may share this line.
     /// Returns `None` if the connection is not Modbus.

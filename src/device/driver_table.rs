@@ -124,23 +124,23 @@ macro_rules! drivers {
                 match self { $(Self::$wire(wire) => DriverFactory::linuxcncrsh_address(wire)),+ }
             }
 
-            /// Creates the driver of a measuring machine on this wire. `making` contains the other data of the cell
+            /// Creates the driver of a measuring machine on this wire. `context` contains the other data of the cell
             /// that the driver needs. Sends nothing to the machine yet.
             ///
             /// # Errors
             /// The errors of [`DriverFactory::create_cmm`], for example a serial port or a folder that does not exist.
-            pub fn create_cmm(&self, making: &DriverContext<'_>) -> Result<AnyCmm, DriverError> {
-                Ok(match self { $(Self::$wire(wire) => AnyCmm::$wire(wire.create_cmm(making)?)),+ })
+            pub fn create_cmm(&self, context: &DriverContext<'_>) -> Result<AnyCmm, DriverError> {
+                Ok(match self { $(Self::$wire(wire) => AnyCmm::$wire(wire.create_cmm(context)?)),+ })
             }
 
-            /// Creates the driver of a grinder on this wire. `making` contains the other data of the cell that the
+            /// Creates the driver of a grinder on this wire. `context` contains the other data of the cell that the
             /// driver needs. Sends nothing to the machine yet.
             ///
             /// # Errors
             /// The errors of [`DriverFactory::create_grinder`], for example a serial port or a folder that does not
             /// exist.
-            pub fn create_grinder(&self, making: &DriverContext<'_>) -> Result<AnyGrinder, DriverError> {
-                Ok(match self { $(Self::$wire(wire) => AnyGrinder::$wire(wire.create_grinder(making)?)),+ })
+            pub fn create_grinder(&self, context: &DriverContext<'_>) -> Result<AnyGrinder, DriverError> {
+                Ok(match self { $(Self::$wire(wire) => AnyGrinder::$wire(wire.create_grinder(context)?)),+ })
             }
         }
 

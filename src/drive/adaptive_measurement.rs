@@ -51,8 +51,8 @@ pub(super) fn evaluate_touches(
     let open = |chosen: Vec<usize>| chosen.into_iter().filter(|&k| tried[k].is_none()).collect();
     let first: Vec<usize> = open(farthest_points(&places, MIN_TOUCHES));
     if points.tried_targets.len() == 1 && !first.is_empty() {
-        let why = "the first touches found the part at its expected place";
-        return TouchEvaluation { form: Err(why.to_owned()), next: Some((short_tour(&places, first), why)) };
+        let reason = "the first touches found the part at its expected place";
+        return TouchEvaluation { form: Err(reason.to_owned()), next: Some((short_tour(&places, first), reason)) };
     }
     let so_far = PartialMeasurement { targets: &places, tried: &tried, touched: &points.point_targets };
     let purpose = adaptive.stopping_criteria(u32::from(cycle.correction.cycle) < adaptive.max_cycles);
@@ -160,8 +160,8 @@ fn project_onto_nominal(task: &Task, near: &Target) -> Target {
     }
 }
 
-fn reason_message(why: Reason) -> &'static str {
-    match why {
+fn reason_message(reason: Reason) -> &'static str {
+    match reason {
         Reason::WithinLimits => "the part is in tolerance",
         Reason::FormKnown => "the form is known well enough for a correction",
         Reason::CorrectionPreferred => "another pass improves the part more than further touches do",

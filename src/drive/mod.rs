@@ -406,7 +406,7 @@ impl Drive {
             tokio::select! {
                 biased;
                 Some(ordered) = self.orders.recv() => self.handle_order(ordered).await,
-                why = self.recorder.next_failure() => self.report_record_failure(why).await,
+                reason = self.recorder.next_failure() => self.report_record_failure(reason).await,
                 recorded = wait_for_first_record(&mut self.backlog) => self.handle_recorded(recorded).await,
                 Some(computed) = self.computations.join_next_with_id() => match computed {
                     Ok((id, computed)) => {
@@ -547,13 +547,13 @@ impl Drive {
     /// states that only steps to make the cell safe were carried out, and why the order was not recorded. Does nothing
     /// while records can be written.
     fn answer_unrecorded_orders(&mut self) {
-        let Some(why) = &self.record_failure_reason else { return };
+        let Some(reason) = &self.record_failure_reason else { return };
         let status = self.snapshot();
         for waiting in &mut self.backlog {
             match std::mem::replace(&mut waiting.action, RecordAction::Nothing) {
                 RecordAction::Answer { answer, message, .. } => {
                     let message = format!(
-                        "{message}; only the steps that make the cell safe were carried out, because the order was not recorded: {why}"
+                        "{message}; only the steps that make the cell safe were carried out, because the order was not recorded: {reason}"
                     );
                     // The person who asked may be gone.
                     drop(answer.send(Reply { accepted: false, message, status: status.clone() }));
@@ -678,7 +678,7 @@ impl Drive {
         tokio::spawn(async move {
             let told = match asked {
                 Ok(taken) => taken.await.unwrap_or_else(|_| Err("the run is over".into())),
-                Err(why) => Err(why),
+                Err(reason) => Err(reason),
             };
             let message = told.as_ref().err().unwrap_or(&status.message).clone();
             let reply = Reply { accepted: told.is_ok(), message, status };
@@ -852,8 +852,10 @@ impl Drive {
                 self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Nothing });
             }
             // A failure to write the loop's own final files is only shown, because the run is over.
-            Err(why) if self.ending.is_some() => self.notify(Notice::RecordFailed { message: failure_message(&why) }),
-            Err(why) => Box::pin(self.report_record_failure(why)).await,
+            Err(reason) if self.ending.is_some() => {
+                self.notify(Notice::RecordFailed { message: failure_message(&reason) })
+            }
+            Err(reason) => Box::pin(self.report_record_failure(reason)).await,
         }
     }
 
@@ -948,8 +950,8 @@ impl Drive {
             let recorded = tokio::select! {
                 biased;
                 recorded = wait_for_first_record(&mut self.backlog) => recorded,
-                why = self.recorder.next_failure() => {
-                    self.record_failure_reason = Some(failure_message(&why));
+                reason = self.recorder.next_failure() => {
+                    self.record_failure_reason = Some(failure_message(&reason));
                     self.answer_unrecorded_orders();
                     continue;
                 }

@@ -68,28 +68,28 @@ pub(super) fn implausible_figure(told: &CommandedPass, record: &PassRecord) -> O
     };
     let [width, height] = [pass.x_mm, pass.y_mm].map(|[low, high]| high - low);
     let tracks_mm = width * height / pass.track_spacing_mm;
-    let least_path_mm = match outline {
+    let min_path_mm = match outline {
         Some(outline) => MIN_PATH_SHARE * outline.area_mm2().min(width * height) / pass.track_spacing_mm,
         None => MIN_RECTANGLE_PATH_SHARE * tracks_mm,
     };
     // The pass crosses the part once for each cut of the removal, once to finish, and then to spark out.
     let times = (max_depth_mm / pass.depth_of_cut_mm).ceil() + 1.0 + f64::from(pass.spark_out_passes);
-    let most_path_mm = MAX_PATH_FACTOR * tracks_mm * times;
+    let max_path_mm = MAX_PATH_FACTOR * tracks_mm * times;
     // Roughing and moves in the air may be faster than the feed. The last tracks need at least this time.
-    let least_s = least_path_mm / (pass.feed_mm_min / 60.0);
+    let min_s = min_path_mm / (pass.feed_mm_min / 60.0);
     // Manual reports of start and end are no measure of the duration. A machine that reports a path has a clock.
     let measured_s = record.duration_s.filter(|_| record.path_mm.is_some());
     let wheel = [1.0 - MAX_WHEEL_RADIUS_DIFFERENCE, 1.0 + MAX_WHEEL_RADIUS_DIFFERENCE]
         .map(|share| share * pass.wheel_radius_mm);
     let any = f64::INFINITY;
-    let most_mm = MAX_DEPTH_FACTOR * max_depth_mm + DEPTH_MARGIN_MM;
-    let most_mm3 = MAX_SURFACE_FACTOR * width * height * most_mm;
-    range(record.path_mm, "the path travelled", least_path_mm, any, "mm")
-        .or_else(|| range(record.path_mm, "the path travelled", -any, most_path_mm, "mm"))
-        .or_else(|| range(measured_s, "its duration", least_s, any, "s"))
-        .or_else(|| range(record.max_depth_mm, "the largest removed depth", -any, most_mm, "mm"))
+    let max_mm = MAX_DEPTH_FACTOR * max_depth_mm + DEPTH_MARGIN_MM;
+    let max_mm3 = MAX_SURFACE_FACTOR * width * height * max_mm;
+    range(record.path_mm, "the path travelled", min_path_mm, any, "mm")
+        .or_else(|| range(record.path_mm, "the path travelled", -any, max_path_mm, "mm"))
+        .or_else(|| range(measured_s, "its duration", min_s, any, "s"))
+        .or_else(|| range(record.max_depth_mm, "the largest removed depth", -any, max_mm, "mm"))
         .or_else(|| range(record.wheel_radius_mm, "the radius of the wheel", wheel[0], wheel[1], "mm"))
-        .or_else(|| range(record.removed_mm3, "the removed volume", 0.0, most_mm3, "mm³"))
+        .or_else(|| range(record.removed_mm3, "the removed volume", 0.0, max_mm3, "mm³"))
         .or_else(|| contradiction(record))
 }
 

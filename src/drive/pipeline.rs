@@ -806,14 +806,15 @@ fn compute_correction(
     files: &mut OutputFiles,
     cycle: &CycleState,
 ) -> Result<(CompensationSummary, Correction), ComputationError<CompensationRefusal>> {
-    let failed = |why: &dyn std::fmt::Display| ComputationError::Failed(CompensationRefusal::Failed(why.to_string()));
+    let failed =
+        |reason: &dyn std::fmt::Display| ComputationError::Failed(CompensationRefusal::Failed(reason.to_string()));
     let found = cycle.registration.as_ref().ok_or_else(|| {
         failed(&"the measurement of this cycle has no registration, so no correction can be computed")
     })?;
     // If the part may slide within its own surface, the place of the map on the part is unknown.
     let covariance = cycle.form.as_ref().map_or(&found.quality.covariance, |form| &form.frame_covariance);
-    if let Some(why) = map_obstacle(found, covariance, &task.map_limits) {
-        return Err(ComputationError::Failed(CompensationRefusal::WeakDirections(vec![why])));
+    if let Some(reason) = map_obstacle(found, covariance, &task.map_limits) {
+        return Err(ComputationError::Failed(CompensationRefusal::WeakDirections(vec![reason])));
     }
     let map = match &cycle.error_map {
         Some(map) => Arc::clone(map),
@@ -834,21 +835,21 @@ fn compute_correction(
         })?;
     // A pass that cannot be ground must leave no correction that could be mistaken for one.
     let warning = task.save_program(files, &step.correction).map_err(|error| match classify_error(error) {
-        ComputationError::Failed(why) => failed(&format_args!("the next pass cannot be ground: {why}")),
-        ComputationError::NotSaved(why) => ComputationError::NotSaved(why),
+        ComputationError::Failed(reason) => failed(&format_args!("the next pass cannot be ground: {reason}")),
+        ComputationError::NotSaved(reason) => ComputationError::NotSaved(reason),
     })?;
     task.save_correction(files, &step.correction, &cycle.correction).map_err(|error| match classify_error(error) {
-        ComputationError::Failed(why) => failed(&why),
-        ComputationError::NotSaved(why) => ComputationError::NotSaved(why),
+        ComputationError::Failed(reason) => failed(&reason),
+        ComputationError::NotSaved(reason) => ComputationError::NotSaved(reason),
     })?;
-    let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
+    let max_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let told = cycle.figures.as_ref().and_then(|figures| figures.form);
     let [pv_mm, rms_mm, scatter_mm] = told.map_or([found.quality.pv_mm, found.quality.rms_mm, 0.0], |form| {
         [form.pv_998.median_mm, form.rms.median_mm, form.noise_sigma_mm]
     });
     let expected_mm = subtract_in_quadrature(scatter_mm, known.forecast(&map, task.scallops_rms_mm()).rms_mm);
     let summary = CompensationSummary {
-        max_correction_mm: largest_mm,
+        max_correction_mm: max_mm,
         depth_mm: step.depth_mm,
         predicted_pv_mm: expected_mm * pv_mm / rms_mm.max(f64::MIN_POSITIVE),
         predicted_rms_mm: expected_mm,

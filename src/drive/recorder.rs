@@ -375,8 +375,8 @@ pub(super) fn classify_error<E: std::error::Error + 'static>(error: E) -> Comput
         if let Some(io) = next.downcast_ref::<std::io::Error>() {
             use std::io::ErrorKind::{QuotaExceeded, StorageFull};
             let is_full = matches!(io.kind(), StorageFull | QuotaExceeded);
-            let why = if is_full { RecordFailure::DiskFull } else { RecordFailure::Unwritable };
-            return ComputationError::NotSaved(why(error.to_string()));
+            let reason = if is_full { RecordFailure::DiskFull } else { RecordFailure::Unwritable };
+            return ComputationError::NotSaved(reason(error.to_string()));
         }
         cause = next.source();
     }

@@ -337,11 +337,13 @@ impl<'t> Replay<'t> {
             .read_json::<pipeline::RepeatedTouchesRecord>(number, pipeline::REPEATED_TOUCHES_FILE)?
             .map_or(0, |told| told.rounds);
         let touches = (touches, rounds);
-        pipeline::gate_recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches).map_err(|why| {
-            self.differs(format!(
-                "the recorded points of cycle {number} do not pass the checks of a measurement: {why:?}"
-            ))
-        })
+        pipeline::gate_recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches).map_err(
+            |reason| {
+                self.differs(format!(
+                    "the recorded points of cycle {number} do not pass the checks of a measurement: {reason:?}"
+                ))
+            },
+        )
     }
 
     /// Reads the newest recorded JSON file `name` of cycle `number`. Returns `None` if no such file is recorded.

@@ -760,7 +760,7 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    /// Reports to the cell that the request `what` failed with `error`. If the link is lost, reports the loss first.
+    /// Reports to the cell that the request `request` failed with `error`. If the link is lost, reports the loss first.
     /// Then reports a fault of the machine as a fault, and every other error as a refusal of the request.
     async fn report_failure(&mut self, request: MachineRequest, error: DeviceError) {
         if error.is_link() {

@@ -1,9 +1,9 @@
 //! Detection of the columns that are coordinates, by their names in the header: names are understood completely or
 //! rejected.
 //!
-//! A name consists of an axis and of words that say which points it belongs to: `X_act`, `Measured X`,
-//! `x (nominal) [mm]`. Most machines write measured and nominal points in the same table. If the nominal points were
-//! read as measured ones, every part would appear good. So a header with two groups of coordinates is ambiguous and requires a
+//! A name consists of an axis and of words that say which points it belongs to: `X_act`, `Measured X`, `x (nominal)
+//! [mm]`. Most machines write measured and nominal points in the same table. If the nominal points were read as
+//! measured ones, every part would appear good. So a header with two groups of coordinates is ambiguous and requires a
 //! choice, and a header that names no group at all is not read in the usual order.
 
 use std::borrow::Cow;

@@ -272,7 +272,7 @@ mod tests {
 
     #[test]
     fn dmis_errors_name_their_line() {
-        for (of, with, why) in [
+        for (of, with, reason) in [
             ("ENDFIL\n", "", "expected ENDFIL at the end"),
             ("UNITS/MM, ANGDEC\n", "", "line 8: expected UNITS above the first point"),
             ("UNITS/MM", "UNITS/FURLONG", "line 3: expected a unit of length"),
@@ -286,7 +286,7 @@ mod tests {
             let text = file().replace(of, with);
             assert_ne!(text, file());
             let error = parsed(&text).unwrap_err().to_string();
-            assert!(error.contains(why), "{with:?}: {error}");
+            assert!(error.contains(reason), "{with:?}: {error}");
         }
     }
 }

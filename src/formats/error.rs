@@ -170,9 +170,9 @@ pub enum FormatError {
     Contradiction { path: PathBuf, key: &'static str, found: String, by: &'static str, expected: String },
     /// A target number that the plan does not have, or that occurred before.
     #[error(
-        "{path}, line {line}: index `{found}` {why}; export the result again, with the target numbers of the plan as the index"
+        "{path}, line {line}: index `{found}` {reason}; export the result again, with the target numbers of the plan as the index"
     )]
-    Index { path: PathBuf, line: u64, found: String, why: &'static str },
+    Index { path: PathBuf, line: u64, found: String, reason: &'static str },
     /// More than one probe in the same file.
     #[error(
         "{path}, line {line}: the probe is `{found}`, but `{first}` in the lines above; export one file for each probe"

@@ -89,11 +89,11 @@ pub fn write_figures(
     let (mut rows, mut missing) = (Vec::new(), Vec::new());
     match figures {
         Ok(figures) => rows.extend(label_figures(figures, taken_out)),
-        Err(why) => missing.push(format!("figures of the points: {why}")),
+        Err(reason) => missing.push(format!("figures of the points: {reason}")),
     }
     match slope {
         Some(Ok(slope)) => rows.extend(label_slope(slope, taken_out)),
-        Some(Err(why)) => missing.push(format!("slopes: {why}")),
+        Some(Err(reason)) => missing.push(format!("slopes: {reason}")),
         None => missing.push("slopes: there is no map".to_owned()),
     }
     let found = figures.ok();

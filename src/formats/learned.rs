@@ -84,8 +84,8 @@ struct Head {
 pub enum LearnedError {
     #[error(transparent)]
     File(#[from] FormatError),
-    #[error("{path}: this file cannot be used: {why}; copy the folder of this run from the archive again")]
-    Broken { path: PathBuf, why: String },
+    #[error("{path}: this file cannot be used: {reason}; copy the folder of this run from the archive again")]
+    Broken { path: PathBuf, reason: String },
 }
 
 impl Learned {
@@ -159,7 +159,7 @@ impl Learned {
     /// A file that cannot be read, is too large, is not written by Regrind, or has an impossible number.
     pub fn read(run: &Path, setting: &str, simulation: bool) -> Result<Option<(Self, Vec<u8>)>, LearnedError> {
         let path = run.join(LEARNED);
-        let broken = |why| LearnedError::Broken { path: path.clone(), why };
+        let broken = |reason| LearnedError::Broken { path: path.clone(), reason };
         let text = match read_whole(&path, MAX_BYTES) {
             Ok(text) => text,
             Err(FormatError::Unreadable { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {
@@ -195,10 +195,10 @@ impl Learned {
             && learned.kind.as_deref() == Some(kind)
             && learned.simulation == simulation
             && learned.origin.is_none();
-        let broken = |why| Err(LearnedError::Broken { path: from.to_owned(), why });
+        let broken = |reason| Err(LearnedError::Broken { path: from.to_owned(), reason });
         match learned.known.transfer_obstacle() {
             _ if !is_meant => broken("the knowledge is for another kind of parts than this recipe".into()),
-            Some(why) => broken(why),
+            Some(reason) => broken(reason),
             None => Ok(learned),
         }
     }
@@ -209,11 +209,11 @@ impl Learned {
     /// # Errors
     /// A text that Regrind did not write, or that has an impossible number.
     pub fn from_saved(path: &Path, text: &[u8]) -> Result<Self, LearnedError> {
-        let broken = |why| LearnedError::Broken { path: path.to_owned(), why };
+        let broken = |reason| LearnedError::Broken { path: path.to_owned(), reason };
         let learned: Self = serde_json::from_slice(text).map_err(|error| broken(error.to_string()))?;
         match learned.flaw() {
             None => Ok(learned),
-            Some(why) => Err(broken(why)),
+            Some(reason) => Err(broken(reason)),
         }
     }
 

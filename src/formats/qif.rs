@@ -338,7 +338,7 @@ mod tests {
 
     #[test]
     fn qif_errors_name_line_and_element() {
-        for (of, with, why) in [
+        for (of, with, reason) in [
             ("4 5 6", "4 5", "line 6, element Points: expected three numbers for each point"),
             ("4 5 6", "4 five 6", "line 6, element Points: expected a coordinate, found `five`"),
             ("4 5 6", "4 INF 6", "expected a coordinate, found `INF`"),
@@ -361,7 +361,10 @@ mod tests {
             let text = document(SET).replace(of, with);
             assert_ne!(text, document(SET));
             let error = parsed(&text).unwrap_err().to_string();
-            assert!(error.contains(why) || why == "no data" && error.contains("MeasuredPointSet"), "{with:?}: {error}");
+            assert!(
+                error.contains(reason) || reason == "no data" && error.contains("MeasuredPointSet"),
+                "{with:?}: {error}"
+            );
         }
         let cell = Content { coordinates: Some(Coordinates::Contacts), ..Content::default() };
         let error = parse_result(Path::new("x.qif"), document(SET).as_bytes(), &cell).unwrap_err();

@@ -456,7 +456,7 @@ fn whole_number(path: &Path, line: u64, field: &[u8]) -> Result<u32, FormatError
         path: path.to_owned(),
         line,
         found: excerpt(field),
-        why: "is not a whole number",
+        reason: "is not a whole number",
     })
 }
 

@@ -7,8 +7,8 @@
 //! Records form a hash chain. Each record holds the hash of the record before it. Its own hash is `SHA-256("regrind
 //! journal record 1\n" || prev_hash || "\n" || text)`. `prev_hash` has 64 lowercase hexadecimal digits. `text` is the
 //! JSON object of the other fields of the record, with sorted keys and no whitespace; the payload is the text in the
-//! database, unchanged. [`verify()`] therefore finds every change, deletion, insertion and reordering. A cut of the tail
-//! is found with an [`Anchor`]: the number of records and the hash of the last one. The anchor is kept in
+//! database, unchanged. [`verify()`] therefore finds every change, deletion, insertion and reordering. A cut of the
+//! tail is found with an [`Anchor`]: the number of records and the hash of the last one. The anchor is kept in
 //! `journal.anchor`, and in every other place where somebody stored a copy.
 //!
 //! If the computer has an [`AuditKey`], the journal signs its head with that key (Ed25519) every [`SEALED_EVERY`]

@@ -18,7 +18,7 @@ pub enum PublisherEvent {
     /// The publisher is connected from now on.
     Connected { place: String },
     /// The publisher is not connected; it retries.
-    Retrying { place: String, why: String },
+    Retrying { place: String, reason: String },
     /// A client requested something that it may not do here.
     Refused { by: String, what: String },
     /// This many more refusals did not fit in the queue.
@@ -45,8 +45,8 @@ impl EventSender {
         let _ = self.to.try_send(PublisherEvent::Connected { place: place.to_owned() });
     }
 
-    pub(crate) fn retrying(&self, place: &str, why: String) {
-        let _ = self.to.try_send(PublisherEvent::Retrying { place: place.to_owned(), why });
+    pub(crate) fn retrying(&self, place: &str, reason: String) {
+        let _ = self.to.try_send(PublisherEvent::Retrying { place: place.to_owned(), reason });
     }
 
     pub(crate) fn refused(&self, by: String, what: &str) {

@@ -172,8 +172,8 @@ impl Users {
         Ok(Self { users })
     }
 
-    /// Returns the text of the file of users: TOML with a table `user` for each user, which holds name, role and hash of
-    /// the password. [`Users::read`] reads this text.
+    /// Returns the text of the file of users: TOML with a table `user` for each user, which holds name, role and hash
+    /// of the password. [`Users::read`] reads this text.
     pub fn to_text(&self) -> String {
         let written = Written { user: self.users.clone() };
         // The list contains only strings, so the conversion to TOML cannot fail.

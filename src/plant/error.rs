@@ -21,8 +21,8 @@ pub enum PlantError {
         "the database at {place} cannot be reached: {what}; check that the database runs and that the network connection works"
     )]
     Unreachable { place: String, what: String },
-    #[error("the database refused {what}: {why}{hint}")]
-    Refused { what: &'static str, why: String, hint: String },
+    #[error("the database refused {what}: {reason}{hint}")]
+    Refused { what: &'static str, reason: String, hint: String },
     #[error("the tables of the database have layout {found}, but this program requires layout {known}; {remedy}")]
     Layout { found: i32, known: i32, remedy: &'static str },
     #[error(
@@ -39,8 +39,8 @@ pub enum PlantError {
     NoRun { cell: String, name: String },
     #[error("{0}")]
     Recipe(String),
-    #[error("part {work} of the queue: {why}; to take another part: regrind work")]
-    Work { work: i64, why: String },
+    #[error("part {work} of the queue: {reason}; to take another part: regrind work")]
+    Work { work: i64, reason: String },
     #[error("{}: the folder for large files cannot be used: {source}; check that it exists, and that you have the \
              right to write in it", .path.display())]
     Folder { path: PathBuf, source: io::Error },
@@ -75,7 +75,7 @@ pub(crate) fn refused(what: &'static str) -> impl Fn(tokio_postgres::Error) -> P
             return PlantError::Unreachable { place: "the server".into(), what: said.message().to_owned() };
         }
         let hint = said.hint().map_or(String::new(), |hint| format!("; {hint}"));
-        PlantError::Refused { what, why: said.message().to_owned(), hint }
+        PlantError::Refused { what, reason: said.message().to_owned(), hint }
     }
 }
 

@@ -54,7 +54,7 @@ impl Knowledge {
     ///
     /// # Errors
     /// The plant cannot be reached, or this computer did not sign in as a cell. An invalid result is not an error: the
-    /// reason is added to `left_alone`, the list of rejected results, and reported to the plant.
+    /// reason is added to `skipped`, the list of rejected results, and reported to the plant.
     pub async fn query(
         link: &DatabaseLink,
         artefacts: Option<&ArtefactSettings>,
@@ -83,7 +83,7 @@ impl Knowledge {
 
     /// Checks the results of cells in the database rows `rows`, and returns the valid results. `simulation` is true if
     /// the results must come from simulated runs. `artefacts` names the folder with the large files. Reports the reason
-    /// for each invalid result to the plant, and adds the reason to `left_alone`, the list of rejected results.
+    /// for each invalid result to the plant, and adds the reason to `skipped`, the list of rejected results.
     ///
     /// Returns an error if the plant cannot be reached.
     async fn verify_results(
@@ -97,8 +97,8 @@ impl Knowledge {
             let (cell, run): (String, String) = (row.get(2), row.get(3));
             match read_result(&row, artefacts, simulation) {
                 Ok(given) => believed.push(given),
-                Err(why) => {
-                    let words = format!("the learned error of {run} of {cell} is ignored: {why}");
+                Err(reason) => {
+                    let words = format!("the learned error of {run} of {cell} is ignored: {reason}");
                     let values: [&(dyn ToSql + Sync); 3] = [&run, &"a lesson refused", &words];
                     let told = link.client().query_one("SELECT complain($1, $2, $3)", &values).await;
                     told.map_err(refused("the report of a problem"))?;

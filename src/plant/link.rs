@@ -102,7 +102,7 @@ fn unopened(place: &str, error: &tokio_postgres::Error) -> PlantError {
         Some(said) if ["28", "3D", "42"].iter().any(|class| said.code().code().starts_with(class)) => {
             PlantError::Refused {
                 what: "the login of this computer",
-                why: said.message().to_owned(),
+                reason: said.message().to_owned(),
                 hint: "; check name, user and password of [database]".into(),
             }
         }

@@ -76,8 +76,8 @@ impl PlantRecipe {
         let values: [&(dyn ToSql + Sync); 5] = [&self.name, &self.version, &self.text, &names, &contents];
         let text = "SELECT sha256, refused FROM propose_recipe($1, $2, $3, $4, $5)";
         let row = link.client().query_one(text, &values).await.map_err(&failed)?;
-        if let Some(why) = row.get::<_, Option<String>>(1) {
-            return Err(PlantError::Recipe(format!("{why}; nothing was stored")));
+        if let Some(reason) = row.get::<_, Option<String>>(1) {
+            return Err(PlantError::Recipe(format!("{reason}; nothing was stored")));
         }
         Ok(digits(row.get(0)))
     }

@@ -76,7 +76,7 @@ impl Replicator {
 
     /// Returns the runs that are no longer replicated because they differ from the plant's copy, each with the reason.
     pub fn skipped(&self) -> impl Iterator<Item = (&str, &str)> {
-        self.skipped.iter().map(|(run, why)| (run.as_str(), why.as_str()))
+        self.skipped.iter().map(|(run, reason)| (run.as_str(), reason.as_str()))
     }
 
     /// Sends the records and files that the plant does not have yet, the run with the newest change first. Returns the
@@ -173,10 +173,10 @@ impl Replicator {
         id: i32,
         shipped: &mut ReplicationResult,
     ) -> Result<(), PlantError> {
-        if let Some(why) = teach(link, folder, id).await?
+        if let Some(reason) = teach(link, folder, id).await?
             && self.reported.insert((run.to_owned(), LEARNED.to_owned()))
         {
-            shipped.differ.push((run.to_owned(), why));
+            shipped.differ.push((run.to_owned(), reason));
         }
         Ok(())
     }

@@ -109,7 +109,7 @@ impl LeasedRun {
     pub async fn finish(&self, link: &DatabaseLink, result: &Result<Value, String>) -> Result<bool, PlantError> {
         let told = match result {
             Ok(told) => told.to_string(),
-            Err(why) => serde_json::json!({ "error": why }).to_string(),
+            Err(reason) => serde_json::json!({ "error": reason }).to_string(),
         };
         let values: [&(dyn ToSql + Sync); 5] = [&self.study, &self.number, &self.lease, &result.is_err(), &told];
         let text = "SELECT finish_job($1, $2, $3, $4, $5::text::jsonb)";

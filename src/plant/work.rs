@@ -82,14 +82,14 @@ impl Lease {
         self.ask(link, "SELECT begin_work($1, $2, $3)", &[&self.work, &self.number, &run]).await
     }
 
-    /// Returns the leased part to the queue before a run has begun to make it. `why` is the reason, which the plant
+    /// Returns the leased part to the queue before a run has begun to make it. `reason` is the reason, which the plant
     /// stores.
     ///
     /// # Errors
     /// Fails if this lease of the part is no longer valid, for example because another cell has leased the part. Also
     /// fails if the plant cannot be reached.
-    pub async fn hand_back(&self, link: &DatabaseLink, why: &str) -> Result<(), PlantError> {
-        self.ask(link, "SELECT return_work($1, $2, $3)", &[&self.work, &self.number, &why]).await
+    pub async fn hand_back(&self, link: &DatabaseLink, reason: &str) -> Result<(), PlantError> {
+        self.ask(link, "SELECT return_work($1, $2, $3)", &[&self.work, &self.number, &reason]).await
     }
 
     async fn ask(&self, link: &DatabaseLink, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<(), PlantError> {
@@ -121,22 +121,24 @@ impl StartedPart {
     }
 
     /// Returns the part to the queue because its run has commanded no machine. The caller must have checked this in the
-    /// journal of the run. `why` is the reason, which the plant stores.
+    /// journal of the run. `reason` is the reason, which the plant stores.
     ///
     /// # Errors
     /// Fails if the plant's copy shows that the run has commanded a machine or has ended. Fails if this cell has not
     /// begun the part in this run, or if the plant cannot be reached.
-    pub async fn give_back(&self, link: &DatabaseLink, why: &str) -> Result<(), PlantError> {
-        answered(link, self.lease.work, "SELECT give_back_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
+    pub async fn give_back(&self, link: &DatabaseLink, reason: &str) -> Result<(), PlantError> {
+        answered(link, self.lease.work, "SELECT give_back_work($1, $2, $3)", &[&self.lease.work, &self.run, &reason])
+            .await
     }
 
     /// Marks the part as ended in the plant, because its run does not continue. The part gets no other run, unless a
-    /// planner puts it into the queue again. `why` is the reason, which the plant stores.
+    /// planner puts it into the queue again. `reason` is the reason, which the plant stores.
     ///
     /// # Errors
     /// Fails if this cell has not begun the part in the run [`StartedPart::run`], or if the plant cannot be reached.
-    pub async fn give_up(&self, link: &DatabaseLink, why: &str) -> Result<(), PlantError> {
-        answered(link, self.lease.work, "SELECT give_up_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
+    pub async fn give_up(&self, link: &DatabaseLink, reason: &str) -> Result<(), PlantError> {
+        answered(link, self.lease.work, "SELECT give_up_work($1, $2, $3)", &[&self.lease.work, &self.run, &reason])
+            .await
     }
 }
 
@@ -151,7 +153,7 @@ async fn answered(
 ) -> Result<(), PlantError> {
     let row = link.client().query_one(text, values).await.map_err(refused("a part"))?;
     match row.get::<_, Option<String>>(0) {
-        Some(why) => Err(PlantError::Work { work, why }),
+        Some(reason) => Err(PlantError::Work { work, reason }),
         None => Ok(()),
     }
 }

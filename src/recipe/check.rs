@@ -288,7 +288,7 @@ fn pattern(written: &MeasurementSettings, folder: &Path, document: &mut Document
                 height_unit: written.file_height_unit.clone(),
             },
         }),
-        (PatternKind::Free, _, _, Some(least_points)) => Some(MeasuringPattern::Free { min_points: least_points }),
+        (PatternKind::Free, _, _, Some(min_points)) => Some(MeasuringPattern::Free { min_points }),
         _ => None,
     };
     // An invalid key is already reported.

@@ -7,8 +7,8 @@
 //! All errors of a file are reported together ([`crate::document::Problems`]), each with its line and column. A
 //! [`Recipe`] keeps its text and its SHA-256, so that the record of a run contains exactly the recipe that was run.
 //!
-//! Units are those of the file and are the last part of each name. Micrometres ([`Micrometres`]) and degrees are converted when
-//! a recipe is turned into numerical settings. Feeds are in mm/min, as on the panel of every grinder.
+//! Units are those of the file and are the last part of each name. Micrometres ([`Micrometres`]) and degrees are
+//! converted when a recipe is turned into numerical settings. Feeds are in mm/min, as on the panel of every grinder.
 
 mod check;
 mod curvature;

@@ -49,7 +49,7 @@ impl CycleMap {
         let drawn = match svg {
             Ok(svg) => within_html(&svg),
             Err(ReportError::File(error)) => return Err(error.into()),
-            Err(why) => format!("<p>No map: {}</p>\n", escaped(&why.to_string())),
+            Err(reason) => format!("<p>No map: {}</p>\n", escaped(&reason.to_string())),
         };
         Ok(format!("<figure>{drawn}<figcaption>Cycle {}, {caption}</figcaption></figure>\n", self.cycle))
     }

@@ -327,7 +327,7 @@ fn parameters(story: &RunHistory) -> String {
 }
 
 fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, level: &str) -> String {
-    let (judged, why) = judgement_of(of);
+    let (judged, reason) = judgement_of(of);
     let figures = match &of.figures {
         Some(figures) => figures_row(figures, tolerance, level),
         None => "<td class=\"n\">-</td>".repeat(6),
@@ -338,7 +338,7 @@ fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, lev
         "<tr class=\"of\"><td class=\"n\">{number}</td><td class=\"t\">{}</td>{figures}</tr>\n\
          <tr><td></td><td colspan=\"7\">{}{remarks}</td></tr>\n",
         escaped(&judged),
-        escaped(&why)
+        escaped(&reason)
     )
 }
 

@@ -306,7 +306,7 @@ impl Order {
     /// result.
     pub(super) fn answer(&self) -> String {
         match (&self.refused, &self.event) {
-            (Some(why), _) => format!("refused: {why}"),
+            (Some(reason), _) => format!("refused: {reason}"),
             (None, Some(_)) => "accepted".to_owned(),
             // The order went to the machine; later records show the result.
             (None, None) => "on record".to_owned(),

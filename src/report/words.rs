@@ -279,8 +279,8 @@ fn found_words(simulated: bool, found: &Occupation) -> String {
     }
 }
 
-fn mismatch_words(why: &ConnectionRefusal) -> String {
-    match why {
+fn mismatch_words(reason: &ConnectionRefusal) -> String {
+    match reason {
         ConnectionRefusal::Unreachable(words) => format!("unreachable: {words}"),
         ConnectionRefusal::WrongDevice(words) => format!("another device: {words}"),
         ConnectionRefusal::WordOrder(words) => {

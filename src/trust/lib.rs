@@ -74,8 +74,8 @@ pub fn read_password(path: &Path) -> Result<String, TrustError> {
     let mut text = String::new();
     File::open(path).and_then(|file| file.take(MAX_BYTES + 1).read_to_string(&mut text)).map_err(unread)?;
     if text.len() as u64 > MAX_BYTES {
-        let why = format!("it is longer than {MAX_BYTES} bytes, too long for a password");
-        return Err(unread(io::Error::new(io::ErrorKind::InvalidData, why)));
+        let reason = format!("it is longer than {MAX_BYTES} bytes, too long for a password");
+        return Err(unread(io::Error::new(io::ErrorKind::InvalidData, reason)));
     }
     Ok(text.trim_end_matches(['\r', '\n']).to_owned())
 }

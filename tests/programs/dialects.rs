@@ -19,7 +19,7 @@ const ARCS_WITHIN_MM: f64 = 1e-4;
 
 fn dialect(name: &str) -> Dialect {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("config/dialects/{name}.toml"));
-    read_dialect(&file).unwrap_or_else(|problems| panic!("{problems}")).0
+    read_dialect(&file).unwrap_or_else(|problems| panic!("{problems}")).dialect
 }
 
 /// Writes the program of a part in a dialect, and reads it with the control of that dialect.
@@ -48,7 +48,7 @@ fn controls_read_back_planned_path() {
         let (path, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
         assert_eq!(program.waypoints.len() as u64, summary.moves, "{name}");
         // Read both from the dialect's file once, not for each of a hundred thousand lines.
-        let (within_mm, longest_line) = (half_a_step_mm(name) * (1.0 + 1e-6), dialect(name).text.longest_line);
+        let (within_mm, max_line_length) = (half_a_step_mm(name) * (1.0 + 1e-6), dialect(name).text.max_line_length);
         let mut at = [f64::NAN; 3];
         for (planned, stop) in path.moves().zip(&program.waypoints) {
             let feed = match planned {
@@ -72,7 +72,7 @@ fn controls_read_back_planned_path() {
         assert_eq!(program.tolerance_mm, (name != "fanuc").then_some(part.programs.path_tolerance_mm), "{name}");
         let says = |words: &str| program.comments.iter().any(|comment| comment.to_ascii_lowercase() == words);
         assert!(says(&format!("map: sha256 {}", "a5".repeat(32))) && says("simulation"), "{name}");
-        assert!(text.lines().all(|line| line.len() <= longest_line), "{name}");
+        assert!(text.lines().all(|line| line.len() <= max_line_length), "{name}");
     }
 }
 

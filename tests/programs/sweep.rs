@@ -201,7 +201,8 @@ fn scallop_figures_match_swept_wheel() {
         part.programs.options = PathOptions { pattern, ..with(&part.programs.options, wheel, 1.0) };
         let (swept, _) = program(&part);
         let told = part.programs.path(&correction(part.half_mm)).unwrap().0.scallops();
-        // Grooves all over the part, each looked at from its one side to the other: as far as two tracks are apart, wherever that begins.
+        // Grooves all over the part, each looked at from its one side to the other: as far as two tracks are apart,
+        // wherever that begins.
         const GROOVES: [usize; 2] = [9, 6];
         const PLACES: usize = 10;
         let (mut highest, mut squares, mut sum, mut grooves) = (0.0f64, 0.0, 0.0, 0.0);

@@ -31,7 +31,7 @@ fn head(about: RotationAxis, pivot_mm: Option<[f64; 3]>, angle_decimals: i32) ->
 /// Writes the program of a part in a dialect, and reads it with the control of that dialect.
 fn written(part: &mut Part, name: &str) -> (Program, String) {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("config/dialects/{name}.toml"));
-    part.programs.dialect = read_dialect(&file).unwrap_or_else(|problems| panic!("{problems}")).0;
+    part.programs.dialect = read_dialect(&file).unwrap_or_else(|problems| panic!("{problems}")).dialect;
     part.programs.controller_tolerance_mm = Some(part.programs.path_tolerance_mm);
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("part");
@@ -255,7 +255,7 @@ fn tilted_program_needs_rotary_axis() {
     part.programs.arcs_within_mm = None;
     // A control that has no words for the tilt.
     part.programs.dialect =
-        read_dialect(&Path::new(env!("CARGO_MANIFEST_DIR")).join("config/dialects/heidenhain.toml")).unwrap().0;
+        read_dialect(&Path::new(env!("CARGO_MANIFEST_DIR")).join("config/dialects/heidenhain.toml")).unwrap().dialect;
     let refused = part.programs.check_dialect().unwrap_err().to_string();
     assert!(refused.contains("[rotary.slides]") && refused.contains("grinder.rotary.pivot_mm"), "{refused}");
 }

@@ -46,7 +46,7 @@ fn places(plan: &Plan) -> BTreeSet<[u64; 3]> {
 }
 
 /// Returns the minimum distance between any two of the first `of` targets, in mm.
-fn least_apart_mm(plan: &Plan, of: usize) -> f64 {
+fn min_apart_mm(plan: &Plan, of: usize) -> f64 {
     let at = |k: usize| plan.targets[k].point_mm;
     let apart = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt();
     let pairs = (0..of).flat_map(|a| (0..a).map(move |b| (a, b)));
@@ -82,7 +82,7 @@ async fn careful_start_after_refused_measurement() {
     assert!(again.targets.iter().enumerate().all(|(k, target)| target.index as usize == k));
     // The same positions, with the first of them far apart.
     assert_eq!((places(again), again.targets.len()), (places(first), first.targets.len()));
-    let wide = least_apart_mm(again, 9);
+    let wide = min_apart_mm(again, 9);
     assert!(wide > 10.0, "{wide} mm apart");
 }
 

@@ -174,10 +174,10 @@ fn locked_mirror_map_handed_over_once() {
     };
     let correction = values(&fs::read_to_string(handed.join("correction.csv")).unwrap());
     assert_eq!(correction.len(), (json["columns"].as_u64().unwrap() * json["rows"].as_u64().unwrap()) as usize);
-    let largest_um = correction.iter().fold(0.0f64, |most, v| most.max(1e3 * v.abs()));
-    println!("{} nodes, up to {largest_um:.1} um", correction.len());
+    let max_um = correction.iter().fold(0.0f64, |most, v| most.max(1e3 * v.abs()));
+    println!("{} nodes, up to {max_um:.1} um", correction.len());
     // One target is 630 µm low in three touches, and one neighbour agrees: half of that is in the map.
-    assert!(largest_um > 20.0 && largest_um < 500.0);
+    assert!(max_um > 20.0 && max_um < 500.0);
     assert!(folder.join("cycle-1/error_map.csv").is_file());
     // The confirmation of a person who works by another map is refused.
     program.until("a pass that is under way", |_| match shop.confirm("started", "00000000") {

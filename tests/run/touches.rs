@@ -166,11 +166,11 @@ fn adaptive_resume_repeats_no_touch() {
         ],
     );
     let _serving = on_serial_lines(home.path(), &recipe);
-    let (mut most_kills, mut parts) = (0, 0);
+    let (mut max_kills, mut parts) = (0, 0);
     for seed in cases([31, 32], 2) {
         parts += 1;
         let (folder, kills) = run_with_kills(home.path(), seed);
-        most_kills = kills.max(most_kills);
+        max_kills = kills.max(max_kills);
         let told = document(&folder.join("result.json"));
         println!("seed {seed}: {kills} kills, {}", told["touches"]);
         let verified = verify(&folder).unwrap();
@@ -190,6 +190,6 @@ fn adaptive_resume_repeats_no_touch() {
             assert_eq!(all.len(), count, "seed {seed}: a target was touched twice");
         }
     }
-    assert!(most_kills > 0);
+    assert!(max_kills > 0);
     assert!(began_once(home.path()) >= 4 * parts);
 }

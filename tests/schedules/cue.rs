@@ -101,8 +101,8 @@ impl When {
 }
 
 /// Draws a duration up to this many seconds; some milliseconds are as likely as some seconds.
-pub fn any_length(chance: &mut StdRng, most_s: f64) -> Duration {
-    Duration::from_secs_f64(1e-3 * (1e3 * most_s).powf(chance.random::<f64>()))
+pub fn any_length(chance: &mut StdRng, max_s: f64) -> Duration {
+    Duration::from_secs_f64(1e-3 * (1e3 * max_s).powf(chance.random::<f64>()))
 }
 
 /// Counters of the moments of each kind, for tasks that wait for one.

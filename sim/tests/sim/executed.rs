@@ -1,4 +1,5 @@
-//! The wheel along a path that somebody else executes, against what can be worked out by hand and against the grinder that makes its own.
+//! The wheel along a path that somebody else executes, against what can be worked out by hand and against the grinder
+//! that makes its own.
 
 use crate::common::{grind, net, pass, small_perfect, zero_map};
 use regrind_sim::cmm::TouchResult;
@@ -8,7 +9,8 @@ use regrind_sim::world::World;
 const HALF_MM: [f64; 2] = [15.0, 10.0];
 const RADIUS_MM: f64 = 12.5;
 
-/// Moves the wheel over tracks along x, to and fro, at a height over the nominal surface, as a program has it that lifts off after each.
+/// Moves the wheel over tracks along x, to and fro, at a height over the nominal surface, as a program has it that
+/// lifts off after each.
 fn sweep(world: &World, spacing_mm: f64, height_mm: f64, tracks: impl Iterator<Item = u32>, until_x_mm: f64) {
     let mut wheel = world.wheel(RADIUS_MM).unwrap();
     let mut clock = 0.0;

@@ -179,7 +179,8 @@ fn scallop_ridges_between_tracks() {
     grinder.advance((24.0 * 33.0 + 23.0) / 50.0);
     grinder.retract();
     grinder.end_job(3);
-    // Tracks lie 1 mm apart from -11.5 mm; the first half of them has been ground. h = t^2 / (8 r), and a parabola between.
+    // Tracks lie 1 mm apart from -11.5 mm; the first half of them has been ground. h = t^2 / (8 r), and a parabola
+    // between.
     let ridge_mm = 1.0 / (8.0 * wheel_mm);
     let stands = |y: f64, height_mm: f64| {
         let found = world.deviation_mm(1.3, y);

@@ -1,4 +1,5 @@
-//! The real physics behind the registers: a part is ground and measured in both word orders, and cannot be in two places.
+//! The real physics behind the registers: a part is ground and measured in both word orders, and cannot be in two
+//! places.
 
 use std::time::Duration;
 

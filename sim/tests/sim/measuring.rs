@@ -17,7 +17,8 @@ fn distance(a: Vec3, b: Vec3) -> f64 {
     (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// A concave sphere of radius 60 with 0.2 mm of stock: centres lie on the sphere of radius 59.8 less the ball's about (0, 0, 60).
+/// A concave sphere of radius 60 with 0.2 mm of stock: centres lie on the sphere of radius 59.8 less the ball's about
+/// (0, 0, 60).
 const CENTRE: Vec3 = [0.0, 0.0, 60.0];
 
 #[test]

@@ -1,4 +1,5 @@
-//! The machine: whole runs, every judgement, every interruption, every pair of state and event, and whatever chance brings.
+//! The machine: whole runs, every judgement, every interruption, every pair of state and event, and whatever chance
+//! brings.
 
 use std::time::Duration;
 
@@ -104,9 +105,9 @@ fn good_answer(command: &Command, figures: &mut dyn FnMut(u32) -> Figures) -> Op
         Command::Acknowledge { device } => Event::Acknowledged { device },
         Command::Register { cycle } => Event::Registered { cycle, figures: figures(cycle) },
         Command::Compensate { cycle } => {
-            let (largest_mm, depth_mm, predicted_pv_mm) = (0.01, 0.02, 0.005);
+            let (max_mm, depth_mm, predicted_pv_mm) = (0.01, 0.02, 0.005);
             let summary = CompensationSummary {
-                max_correction_mm: largest_mm,
+                max_correction_mm: max_mm,
                 depth_mm,
                 predicted_pv_mm,
                 ..CompensationSummary::default()
@@ -433,7 +434,8 @@ fn judgement_omits_absent_limit() {
 
 #[test]
 fn forecast_at_floor_stalls() {
-    // 1.2 um are found, give or take 0.15; another pass is expected to leave 1.05, and none can leave less than the floor.
+    // 1.2 um are found, give or take 0.15; another pass is expected to leave 1.05, and none can leave less than the
+    // floor.
     let with_floor = |floor_um: f64| {
         let forecast = Some(Forecast { rms_mm: 1.05e-3, sigma_mm: 2e-5, floor_mm: Some(floor_um / 1e3) });
         let mut run = TestRun::new(plan(), move |k| match k {
@@ -472,7 +474,8 @@ fn infinite_tolerance_round_trip() {
 
 #[test]
 fn verdict_accept_undecided_or_stalled() {
-    // Limits of 7 and 1 um, uncertainties of 0.3 and 0.05 um: within means the figure and its uncertainty, beyond the figure without it.
+    // Limits of 7 and 1 um, uncertainties of 0.3 and 0.05 um: within means the figure and its uncertainty, beyond the
+    // figure without it.
     let expecting = |rms_um: f64| Forecast { rms_mm: rms_um / 1e3, sigma_mm: 2e-5, floor_mm: Some(rms_um / 1.2e3) };
     let judged = |pv_um: f64, rms_um: f64, next_rms_um: f64| {
         let mut run = TestRun::new(plan(), |k| match k {
@@ -537,7 +540,8 @@ fn outliers_hold_until_remeasured() {
         assert_eq!(run.verdicts(), [Verdict::LeftOut, Verdict::Accept]);
         assert_eq!(run.starts(), [(Device::Grinder, 1), (Device::Cmm, 1), (Device::Cmm, 2)]);
     }
-    // The same measurement goes on with the places that can be touched again by themselves, as often as somebody resumes.
+    // The same measurement goes on with the places that can be touched again by themselves, as often as somebody
+    // resumes.
     let mut run = TestRun::new(plan(), |_| Figures { with_outliers: again(left_out(50.0, 1.2)), ..figures(5.0, 0.5) });
     run.start().run_to_rest();
     for times in 1..=3 {
@@ -598,7 +602,8 @@ fn undisturbed_states() -> Vec<State> {
     way
 }
 
-/// Interrupts a run at every step, and resumes it from where it is held then: it comes to the same end by the same starts.
+/// Interrupts a run at every step, and resumes it from where it is held then: it comes to the same end by the same
+/// starts.
 fn hold_at_every_step(what: &str, interrupt: fn(&mut TestRun)) {
     for state in undisturbed_states().into_iter().filter(|state| *state != State::Completing) {
         let mut run = TestRun::accepted_after_two_passes();
@@ -839,11 +844,11 @@ fn failed_gate_holds_and_remeasures() {
         (GateFailure::Coverage("3 of 9".into()), AlarmId::Coverage),
         (GateFailure::Moved("3 points".into()), AlarmId::PartMoved),
     ];
-    for (why, alarm) in failures {
+    for (reason, alarm) in failures {
         let mut run = TestRun::new(plan(), |_| figures(5.0, 0.5));
         run.start().run_until(State::Execute(Phase::Measure(JobStep::Collect)));
         run.open_commands.clear();
-        run.send(Event::Collected { cycle: 1, targets: 9, found: 9, gate: GateResult::Failed(why) });
+        run.send(Event::Collected { cycle: 1, targets: 9, found: 9, gate: GateResult::Failed(reason) });
         run.run_to_rest();
         assert_eq!((run.alarms(), run.cell.state()), (vec![alarm], State::Held(Phase::Measure(JobStep::Send))));
         assert!(!run.commands.iter().any(|c| matches!(c, Command::Register { .. })));
@@ -1718,10 +1723,12 @@ fn play_random_events(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> 
     run.start();
     let mut excused = std::collections::BTreeMap::<Device, u32>::new();
     let mut seen = 0;
-    // What was seen of each machine, whether it said that it cannot tell, and what a person said of it since its last start.
+    // What was seen of each machine, whether it said that it cannot tell, and what a person said of it since its last
+    // start.
     let (mut clear, mut unknown, mut said) = ([false; 2], [false; 2], [false; 2]);
     let mut aborted = false;
-    // Whether each machine was seen at its job since it was started last: nothing that it says then excuses a second start.
+    // Whether each machine was seen at its job since it was started last: nothing that it says then excuses a second
+    // start.
     let mut begun = [false; 2];
     // Whether each machine was last seen at a stand.
     let mut stands = [true; 2];
@@ -1756,7 +1763,8 @@ fn play_random_events(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> 
         prop_assert!(!before.is_end() || commands.is_empty());
         if !commands.iter().any(|command| matches!(command, Command::Refuse { .. })) {
             match told {
-                // One that no order of the cell has set going is told to hold, with an alarm; the cell is held all the same.
+                // One that no order of the cell has set going is told to hold, with an alarm; the cell is held all the
+                // same.
                 Event::Progressed { device, .. } if before.phase().and_then(Phase::moving_device) != Some(device) => {}
                 Event::Started { device, .. }
                 | Event::Progressed { device, .. }
@@ -1801,7 +1809,8 @@ fn play_random_events(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> 
         let excuses = excused.get(&device).copied().unwrap_or(0);
         prop_assert!(n <= 1 + excuses, "{device} started {n} times for cycle {cycle} after {seen} commands");
     }
-    // The faults stop, nobody answers: by its deadlines alone the cell comes to an end, or holds with an alarm, or waits to be loaded.
+    // The faults stop, nobody answers: by its deadlines alone the cell comes to an end, or holds with an alarm, or
+    // waits to be loaded.
     for _ in 0..12 {
         match run.cell.next_deadline() {
             Some(due) => {

@@ -77,9 +77,9 @@ fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> MachineSimilari
     alike
 }
 
-fn without(why: &str) -> PlantKnowledge {
+fn without(reason: &str) -> PlantKnowledge {
     PlantKnowledge {
         learned: None,
-        description: vec![format!("the plant sends no learned results of other cells: {why}")],
+        description: vec![format!("the plant sends no learned results of other cells: {reason}")],
     }
 }

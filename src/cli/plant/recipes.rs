@@ -213,7 +213,7 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
                 "withdrawn": withdrawn,
             }));
             let state = match (withdrawn, signed.len()) {
-                (Some(why), _) => format!("withdrawn: {why}"),
+                (Some(reason), _) => format!("withdrawn: {reason}"),
                 (None, 0) => "not signed yet".to_owned(),
                 (None, _) => format!("signed by {}", signed.join(", ")),
             };

@@ -36,14 +36,14 @@ impl Correction {
     }
 
     /// Returns true if this correction changes nothing: `values_mm` is 0 at every node, and there are no corrections of
-    /// machine parameters (`set` is `None`).
+    /// machine parameters (`parameters` is `None`).
     pub fn is_zero(&self) -> bool {
         self.parameters.is_none() && self.values_mm.iter().all(|value| *value == 0.0)
     }
 
     /// Returns the visible part of this correction at every node, in millimetres. Visible is the part that a
     /// measurement still shows after registration. This is `values_mm` plus the visible part of the corrections of the
-    /// machine parameters ([`ParameterCorrections::seen_mm`]). Without such corrections, returns `values_mm`.
+    /// machine parameters ([`ParameterCorrections::apparent_mm`]). Without such corrections, returns `values_mm`.
     ///
     /// The machine parameters are the wheel radius, the wheel setting and the part tilt. A part of their corrections
     /// changes the surface like a motion of the part. Registration removes this part from the measurement.
@@ -53,8 +53,8 @@ impl Correction {
 
     /// Returns the total displacement of the surface by this correction at every node, in millimetres along the normal.
     /// A positive displacement leaves material. This is `values_mm` plus the displacement by the corrections of the
-    /// machine parameters wheel radius, wheel setting and part tilt ([`ParameterCorrections::displaced_mm`]). Without
-    /// such corrections, returns `values_mm`.
+    /// machine parameters wheel radius, wheel setting and part tilt ([`ParameterCorrections::displacement_mm`]).
+    /// Without such corrections, returns `values_mm`.
     ///
     /// The amount of removed material follows from this displacement.
     pub fn displacement_mm(&self) -> Cow<'_, [f64]> {

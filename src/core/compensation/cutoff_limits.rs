@@ -32,15 +32,15 @@ pub fn contact_width_mm(wheel_radius_mm: f64, depth_mm: f64) -> f64 {
 /// Returns [`MapError::CutoffBelowContact`] if the cut-off is too short and the contact width is larger than the
 /// distance of the points. Returns [`MapError::CutoffBelowSpacing`] if the cut-off is too short otherwise.
 pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_mm: f64) -> Result<(), MapError> {
-    let least_mm = 2.0 * contact_width_mm.max(point_spacing_mm);
+    let min_mm = 2.0 * contact_width_mm.max(point_spacing_mm);
     // 10 % is the uncertainty of an estimated spacing.
-    if cutoff_mm >= 0.9 * least_mm {
+    if cutoff_mm >= 0.9 * min_mm {
         return Ok(());
     }
     Err(if contact_width_mm > point_spacing_mm {
-        MapError::CutoffBelowContact { cutoff_mm, min_mm: least_mm, contact_width_mm }
+        MapError::CutoffBelowContact { cutoff_mm, min_mm, contact_width_mm }
     } else {
-        MapError::CutoffBelowSpacing { cutoff_mm, min_mm: least_mm, point_spacing_mm }
+        MapError::CutoffBelowSpacing { cutoff_mm, min_mm, point_spacing_mm }
     })
 }
 
@@ -145,10 +145,8 @@ mod tests {
     fn check_cutoff_of_contact_and_spacing() {
         let contact = contact_width_mm(12.5, 0.02);
         assert!(check_cutoff(5.0, contact, 2.14).is_ok());
-        let Err(MapError::CutoffBelowSpacing { min_mm: least_mm, .. }) = check_cutoff(3.0, contact, 2.14) else {
-            panic!()
-        };
-        assert_eq!(least_mm, 4.28);
+        let Err(MapError::CutoffBelowSpacing { min_mm, .. }) = check_cutoff(3.0, contact, 2.14) else { panic!() };
+        assert_eq!(min_mm, 4.28);
         assert!(matches!(check_cutoff(2.0, contact, 0.5), Err(MapError::CutoffBelowContact { .. })));
     }
 }

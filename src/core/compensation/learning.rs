@@ -327,9 +327,9 @@ impl LearningState {
         Forecast { rms_mm, sigma_mm: relative * rms_mm, floor_mm: known.then(|| (rest2 + whole2).sqrt()) }
     }
 
-    /// Returns a pair `[from_mm, gain]` for each band of wavelengths, from the shortest waves to the longest. `from_mm`
-    /// is the shortest wavelength of the band in millimetres. `gain` is the share of the newest error that the next
-    /// correction compensates in this band; 1 compensates all of the error.
+    /// Returns a pair `[min_wavelength_mm, gain]` for each band of wavelengths, from the shortest waves to the longest.
+    /// `min_wavelength_mm` is the shortest wavelength of the band in millimetres. `gain` is the share of the newest
+    /// error that the next correction compensates in this band; 1 compensates all of the error.
     pub fn gains(&self) -> Vec<[f64; 2]> {
         self.bands.iter().map(|band| [band.min_wavelength_mm, self.compensated_share(band)]).collect()
     }
@@ -509,7 +509,7 @@ impl Band {
         self.transferred_share *= 1.0 - self.kalman_gain;
     }
 
-    /// Computes the Wiener share of this band, from 0 to 1, and stores it in `share`. The next correction uses this
+    /// Computes the Wiener share of this band, from 0 to 1, and stores it in `shrinkage`. The next correction uses this
     /// share of the learned mean error.
     ///
     /// Equation: with c = `mean_mm2` / v, the share is 1 - 1 / c, at least 0. If the noise variance is only an

@@ -68,8 +68,8 @@ struct Comparison {
 /// Initial state of a machine that has not ground a recipe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TransferredState {
-    /// State of the machine, as after passes of its own; [`LearningState::next_correction_mm`] is the correction of its first
-    /// pass.
+    /// State of the machine, as after passes of its own; [`LearningState::next_correction_mm`] is the correction of its
+    /// first pass.
     pub state: LearningState,
     /// For each band taken over: its shortest wavelength, in millimetres, and the assumed rms share of the repeatable
     /// error that is a machine's own.
@@ -170,16 +170,16 @@ impl LearningState {
             return Some("a learned mean error has no uncertainty".into());
         }
         let MeanError { grid, values_mm } = self.mean.as_ref()?;
-        let most_mm = values_mm.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
-        if most_mm > MAX_MEAN_MM {
-            return Some(format!("a learned mean error of {most_mm:.3e} mm, limit {MAX_MEAN_MM} mm"));
+        let max_mm = values_mm.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
+        if max_mm > MAX_MEAN_MM {
+            return Some(format!("a learned mean error of {max_mm:.3e} mm, limit {MAX_MEAN_MM} mm"));
         }
         let steps = grid.len() as f64 * (grid.columns + grid.rows) as f64 * self.bands.len() as f64;
         let (columns, rows, bands) = (grid.columns, grid.rows, self.bands.len());
-        let why = || {
+        let reason = || {
             format!("{columns} x {rows} nodes in {bands} bands: {steps:.0e} computation steps, limit {MAX_STEPS:.0e}")
         };
-        (steps > MAX_STEPS).then(why)
+        (steps > MAX_STEPS).then(reason)
     }
 
     /// Predicts the initial state of a machine that has not ground this recipe, from the states of machines that have
@@ -535,9 +535,9 @@ mod tests {
         let mut long = honest.clone();
         let grid = Grid { columns: 1_500_000, rows: 1, first_mm: [0.0; 2], spacing_mm: [1e-9, 1.0] };
         long.mean = Some(MeanError { grid, values_mm: vec![0.0; grid.len()] });
-        for (state, why) in [(certain, "no uncertainty"), (huge, "1.000e200 mm"), (long, "1500000 x 1 nodes")] {
+        for (state, reason) in [(certain, "no uncertainty"), (huge, "1.000e200 mm"), (long, "1500000 x 1 nodes")] {
             assert!(
-                state.is_valid() && state.transfer_obstacle().unwrap().contains(why),
+                state.is_valid() && state.transfer_obstacle().unwrap().contains(reason),
                 "{:?}",
                 state.transfer_obstacle()
             );

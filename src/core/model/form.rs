@@ -646,7 +646,8 @@ pub struct ModelInputs {
     /// deviation. Any further noise is form that is too narrow to be resolved. A standard deviation of 0 means that it
     /// is unknown: all noise then counts as noise of the probe.
     pub probe_noise_mm: [f64; 2],
-    /// Probability that a figure is beyond each of the bounds [`Interval::least_mm`] and [`Interval::most_mm`].
+    /// Probability that a figure is beyond each of the bounds [`Interval::decision_low_mm`] and
+    /// [`Interval::decision_high_mm`].
     pub decision_risk: f64,
     /// Minimum probability that a figure is within its limit, for the part to be accepted.
     pub acceptance_probability: f64,
@@ -1213,8 +1214,9 @@ impl Interval {
     /// the median are 0.
     ///
     /// `inputs` gives the probabilities of three bounds. [`ModelInputs::decision_risk`] is the probability that the
-    /// figure is below the bound `least_mm`, and also that it is above the bound `most_mm`.
-    /// [`ModelInputs::acceptance_probability`] is the probability that the figure is below the bound `accepted_mm`.
+    /// figure is below the bound `decision_low_mm`, and also that it is above the bound `decision_high_mm`.
+    /// [`ModelInputs::acceptance_probability`] is the probability that the figure is below the bound
+    /// `acceptance_bound_mm`.
     pub(super) fn from_samples(
         values: Vec<f64>,
         (lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),

@@ -19,9 +19,9 @@
 //! the form after the best fit, in units of the variance of the noise. The noise s is integrated out with the prior
 //! density 1 / s^2.
 //!
-//! Points up to [`MAX_INDIVIDUAL_POINTS`] are used one by one. For more points, a pivoted Cholesky factor of the products of the
-//! basis functions keeps only what the points can distinguish. A field also has waves shorter than those of the basis.
-//! These are nearly independent from point to point, and add the same amount to every l.
+//! Points up to [`MAX_INDIVIDUAL_POINTS`] are used one by one. For more points, a pivoted Cholesky factor of the
+//! products of the basis functions keeps only what the points can distinguish. A field also has waves shorter than
+//! those of the basis. These are nearly independent from point to point, and add the same amount to every l.
 
 use std::f64::consts::LN_2;
 use std::ops::Range;
@@ -58,8 +58,8 @@ const COSINES_PER_POINT: f64 = 5.0;
 const MIN_COSINES: usize = 150;
 /// Maximum number of points that are used one by one. More points are reduced to the products of the basis functions.
 const MAX_INDIVIDUAL_POINTS: usize = 600;
-/// Degree of the polynomials that are added to the cosines if there are more than [`MAX_INDIVIDUAL_POINTS`] points. Few points
-/// cannot distinguish these polynomials from wheel wear or from a motion of the part.
+/// Degree of the polynomials that are added to the cosines if there are more than [`MAX_INDIVIDUAL_POINTS`] points. Few
+/// points cannot distinguish these polynomials from wheel wear or from a motion of the part.
 const DEGREE: usize = 4;
 /// Relative limit of the standard deviation: a node drops the basis functions after the last one above this share of
 /// the largest.
@@ -168,11 +168,11 @@ impl FieldHypotheses {
     /// [`MAX_RANGE_SIZES`] times the size of the part (root mean square distance of the points from their centroid),
     /// but at least 1.5 times the shortest range.
     fn ranges_mm(&self) -> impl Iterator<Item = f64> + use<> {
-        let least_mm = (MIN_RANGE_SPACINGS * spacing_mm(&self.places))
+        let min_mm = (MIN_RANGE_SPACINGS * spacing_mm(&self.places))
             .max(MIN_RANGE_HALF_WAVELENGTHS * self.basis.min_half_wavelength_mm());
-        let most_mm = (MAX_RANGE_SIZES * size_mm(&self.places)).max(1.5 * least_mm);
-        let ratio = (most_mm / least_mm).ln() / (RANGES - 1) as f64;
-        (0..RANGES).map(move |k| least_mm * (ratio * k as f64).exp())
+        let max_mm = (MAX_RANGE_SIZES * size_mm(&self.places)).max(1.5 * min_mm);
+        let ratio = (max_mm / min_mm).ln() / (RANGES - 1) as f64;
+        (0..RANGES).map(move |k| min_mm * (ratio * k as f64).exp())
     }
 
     /// Prepares the data that all nodes (pairs of one smoothness and one range) share, and no node yet. These data are

@@ -1,7 +1,7 @@
 //! Places between the touched ones: those nodes of a grid that touched places surround.
 //!
-//! A node without a touched place within [`MAX_DISTANCE_SPACINGS`] spacings of the points on some side lies in an untouched area, or
-//! beyond the edge.
+//! A node without a touched place within [`MAX_DISTANCE_SPACINGS`] spacings of the points on some side lies in an
+//! untouched area, or beyond the edge.
 
 use nalgebra::DMatrix;
 

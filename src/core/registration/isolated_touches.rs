@@ -100,14 +100,14 @@ impl NeighbourIndex {
         let feet: Vec<Point> =
             of.iter().map(|&k| deviations[k].point - deviations[k].normal * deviations[k].deviation_mm).collect();
         let (surface_mm, sigma_mm) = robust_median_and_sigma(heights_mm.iter().copied());
-        let least_mm = 0.5 * outlier_sigmas * sigma_mm.max(MIN_SIGMA_MM);
+        let min_mm = 0.5 * outlier_sigmas * sigma_mm.max(MIN_SIGMA_MM);
         Self {
             tree: PointTree::new(feet.iter().copied()),
             heights_mm,
             indices: of,
             projections: feet,
             median_height_mm: surface_mm,
-            half_limit_mm: least_mm,
+            half_limit_mm: min_mm,
         }
     }
 

@@ -259,12 +259,12 @@ mod tests {
         let unit = lateral_error_of(&at(1.0), limits.coverage_factor).error_mm;
         let border = limits.max_error_share * at(1.0).quality.rms_mm / unit;
         assert_eq!(obstacle_of(&at(0.999 * border), &limits), None);
-        let why = obstacle_of(&at(1.001 * border), &limits).unwrap();
-        assert!(why.contains("repeats only to 3.4 mm") && why.contains("registration.lock"), "{why}");
+        let reason = obstacle_of(&at(1.001 * border), &limits).unwrap();
+        assert!(reason.contains("repeats only to 3.4 mm") && reason.contains("registration.lock"), "{reason}");
         let near = MapLimits { max_error_share: 1e3, ..MapLimits::default() };
         assert_eq!(obstacle_of(&at(0.499), &near), None);
-        let why = obstacle_of(&at(0.501), &near).unwrap();
-        assert!(why.contains("1.00 mm, limit 1.00 mm"), "{why}");
+        let reason = obstacle_of(&at(0.501), &near).unwrap();
+        assert!(reason.contains("1.00 mm, limit 1.00 mm"), "{reason}");
         // Locked directions have no variance.
         assert_eq!(obstacle_of(&at(0.0), &limits), None);
     }

@@ -106,8 +106,8 @@ fn fit(part: &Part, measured: &[Point], options: &RegistrationOptions) -> Result
     let mut trace = Vec::new();
     let mut correspondences: Vec<Correspondence> = measured.par_iter().map(|_| Correspondence::INITIAL).collect();
     let descent = trim_and_refit(&problem, &initial, options, &mut correspondences, &mut trace)?;
-    if let Some(least_share) = sampling_directions::sampling_share(&problem, &descent, &correspondences) {
-        return fit(&Part { min_singular_share: least_share, ..*part }, measured, options);
+    if let Some(min_share) = sampling_directions::sampling_share(&problem, &descent, &correspondences) {
+        return fit(&Part { min_singular_share: min_share, ..*part }, measured, options);
     }
     build_registration(part, &problem, descent, correspondences, trace, &initial, options)
 }

@@ -15,8 +15,9 @@ pub enum Method {
     Offset,
     /// Contact points, registered to the nominal surface itself; the probe radius is not used (paper, fig. 12a).
     Contact,
-    /// Probe centres, registered to the nominal surface with the radius subtracted from every distance, the facet looked up
-    /// below the centre (Xiong and Li; paper, fig. 12b). Wrong by micrometres on curved parts; for comparison.
+    /// Probe centres, registered to the nominal surface with the radius subtracted from every distance, the facet
+    /// looked up below the centre (Xiong and Li; paper, fig. 12b). Wrong by micrometres on curved parts; for
+    /// comparison.
     SubtractRadius,
 }
 

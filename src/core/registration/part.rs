@@ -80,8 +80,8 @@ impl<'a> Part<'a> {
             Method::Contact => (0.0, 0.0),
             Method::SubtractRadius => (0.0, radius_mm),
         };
-        let least_share = 1e-6_f64.max(3.0 * nominal.normal_error_rad());
-        Ok(Self { nominal, offset_mm, subtract_mm, centroid: middle, size_mm, min_singular_share: least_share })
+        let min_share = 1e-6_f64.max(3.0 * nominal.normal_error_rad());
+        Ok(Self { nominal, offset_mm, subtract_mm, centroid: middle, size_mm, min_singular_share: min_share })
     }
 
     /// Returns the offset surface on the given side of the nominal surface. `options` select two things: the distance

@@ -31,11 +31,11 @@ impl Spectrum {
     /// Returns the number of directions of the pose that the surface determines. These are the directions with a
     /// squared singular value above `whole * least_share^2`.
     ///
-    /// `least_share` is a share from 0 to 1. `whole` is the sum of all squared singular values before any direction was
+    /// `min_share` is a share from 0 to 1. `whole` is the sum of all squared singular values before any direction was
     /// locked. A locked direction has a singular value of 0 except for rounding errors. `whole` includes the locked
     /// directions, so that the limit exceeds these rounding errors.
-    pub(crate) fn rank(&self, least_share: f64, whole: f64) -> usize {
-        let limit = whole * least_share * least_share;
+    pub(crate) fn rank(&self, min_share: f64, whole: f64) -> usize {
+        let limit = whole * min_share * min_share;
         (0..6).take_while(|&k| self.squares[k] > limit).count()
     }
 

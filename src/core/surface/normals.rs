@@ -201,7 +201,7 @@ fn monomials<const N: usize>(squares: [F64x4; 3], u: F64x4, v: F64x4) -> [F64x4;
 /// true if its pivots are large enough for a solution.
 #[inline(always)]
 fn solve_x4<const N: usize>(mut m: [[F64x4; N]; N], mut x: [F64x4; N]) -> ([F64x4; 2], [bool; LANES]) {
-    let least_pivot: [f64; LANES] =
+    let min_pivot: [f64; LANES] =
         std::array::from_fn(|l| WEAK_PIVOT * (0..N).map(|i| m[i][i].0[l]).fold(0.0, f64::max));
     let mut determined = [true; LANES];
     for j in 0..N {
@@ -211,7 +211,7 @@ fn solve_x4<const N: usize>(mut m: [[F64x4; N]; N], mut x: [F64x4; N]) -> ([F64x
         }
         for l in 0..LANES {
             // NaN is not determined either.
-            determined[l] &= pivot.0[l] > least_pivot[l];
+            determined[l] &= pivot.0[l] > min_pivot[l];
         }
         let inverse = F64x4::splat(1.0) / F64x4(pivot.0.map(f64::sqrt));
         for i in j + 1..N {
@@ -307,14 +307,14 @@ fn solve<const N: usize>(local: &[[f64; 3]]) -> Option<[f64; 9]> {
 
 /// Computes the Cholesky factor L of the symmetric matrix `m`. Writes the entries of L below the diagonal into `m`.
 /// Returns the inverses of the diagonal entries of L. Returns `None` if a pivot (the square of a diagonal entry) is NaN
-/// or is not above `least_pivot`.
+/// or is not above `min_pivot`.
 #[inline(always)]
-fn cholesky<const N: usize>(m: &mut [[f64; N]; N], least_pivot: f64) -> Option<[f64; N]> {
+fn cholesky<const N: usize>(m: &mut [[f64; N]; N], min_pivot: f64) -> Option<[f64; N]> {
     let mut inverse_pivots = [0.0; N];
     for j in 0..N {
         let row_j = m[j];
         let pivot = row_j[j] - (0..j).map(|k| row_j[k] * row_j[k]).sum::<f64>();
-        if pivot.is_nan() || pivot <= least_pivot {
+        if pivot.is_nan() || pivot <= min_pivot {
             return None;
         }
         inverse_pivots[j] = 1.0 / pivot.sqrt();

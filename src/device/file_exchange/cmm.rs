@@ -266,8 +266,8 @@ impl Judge {
         }?;
         if let Some((accepted, plan)) = accepted.as_ref().zip(expected.plan.as_ref()) {
             let path = accepted.files.first().map_or_else(PathBuf::new, |(name, _)| self.settings.inbox.join(name));
-            let CmmExchange { min_coverage: least_found, rehearsal, .. } = self.settings;
-            check_measurement(&path, plan, &accepted.measurement, least_found, rehearsal)?;
+            let CmmExchange { min_coverage: min_found, rehearsal, .. } = self.settings;
+            check_measurement(&path, plan, &accepted.measurement, min_found, rehearsal)?;
         }
         Ok(accepted)
     }
@@ -307,7 +307,7 @@ impl Judge {
             }
             match self.foreign_reason(ticket, &pattern, file) {
                 Ok(None) => ours.push(file),
-                Ok(Some(why)) => notes.push(format!("{} {why}; ignored", file.name)),
+                Ok(Some(reason)) => notes.push(format!("{} {reason}; ignored", file.name)),
                 Err(error) => notes.push(error.to_string()),
             }
         }
@@ -541,8 +541,8 @@ impl Judge {
         let (mut files, mut notes) = (Vec::new(), Vec::new());
         for (k, (file, reference_file)) in pairs.iter().enumerate() {
             let (result, sha) = self.read(expected, &file.path)?;
-            if let Some(why) = self.station_contradiction(expected, file)? {
-                return Err(why);
+            if let Some(reason) = self.station_contradiction(expected, file)? {
+                return Err(reason);
             }
             let bytes = read_bytes(&reference_file.path)?;
             let seen = parse_references(&reference_file.path, &bytes, stations.group.as_deref())?;
@@ -590,8 +590,8 @@ impl Judge {
         file: &WatchedFile,
     ) -> Result<Option<ExchangeError>, ExchangeError> {
         let ticket = &expected.stored.header;
-        let why = self.foreign_reason(ticket, &Pattern::new("*"), file)?;
-        Ok(why.map(|found| {
+        let reason = self.foreign_reason(ticket, &Pattern::new("*"), file)?;
+        Ok(reason.map(|found| {
             FormatError::Contradiction {
                 path: file.path.clone(),
                 key: "the file",

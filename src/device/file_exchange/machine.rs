@@ -299,7 +299,7 @@ impl<M: Exchange> FolderMachine<M> {
     /// machine, if the outbox does not contain the hand-over. Returns [`DeviceError::StartUnknown`] if the outbox
     /// cannot be read.
     fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError, permit: &Permit) -> DeviceResult<Started> {
-        let why = self.failed(MachineCommand::Start, error);
+        let reason = self.failed(MachineCommand::Start, error);
         match self.exchange.open() {
             Ok(handed) => {
                 self.hand_overs = handed;
@@ -308,13 +308,13 @@ impl<M: Exchange> FolderMachine<M> {
                     return if permit.is_withdrawn() { self.take_back_late(armed) } else { self.started(armed) };
                 }
                 (self.state, self.job) = (MachineState::Idle, None);
-                Err(why)
+                Err(reason)
             }
             Err(_) => Err(DeviceError::StartUnknown {
                 machine: Arc::clone(&self.name),
                 job: armed.job,
                 sequence: armed.start_sequence,
-                cause: Box::new(why),
+                cause: Box::new(reason),
             }),
         }
     }
@@ -547,13 +547,13 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
             .await;
         match told {
             // The work continues after the timeout, but no hand-over appears any more.
-            Err(why @ (DeviceError::TimedOut { .. } | DeviceError::Disconnected { .. })) if permit.withdraw() => {
-                Err(why)
+            Err(reason @ (DeviceError::TimedOut { .. } | DeviceError::Disconnected { .. })) if permit.withdraw() => {
+                Err(reason)
             }
             // The hand-over may have appeared in this moment; then it is taken back.
-            Err(why @ (DeviceError::TimedOut { .. } | DeviceError::Disconnected { .. })) => {
+            Err(reason @ (DeviceError::TimedOut { .. } | DeviceError::Disconnected { .. })) => {
                 let machine = Arc::clone(&self.name);
-                Err(DeviceError::StartUnknown { machine, job, sequence, cause: Box::new(why) })
+                Err(DeviceError::StartUnknown { machine, job, sequence, cause: Box::new(reason) })
             }
             told => told,
         }

@@ -59,9 +59,9 @@ impl ResultRequirements<'_> {
         let mut all: Vec<MeasuredPoint> = targets.iter().map(|&index| not_found(index)).collect();
         let place: HashMap<u32, usize> = targets.iter().enumerate().map(|(k, &t)| (t, k)).collect();
         for (row, (index, point)) in indices.iter().zip(&result.points).enumerate() {
-            let wrong = |why| {
+            let wrong = |reason| {
                 let (path, line) = (path.to_owned(), row as u64 + 1);
-                ExchangeError::from(FormatError::Index { path, line, found: index.to_string(), why })
+                ExchangeError::from(FormatError::Index { path, line, found: index.to_string(), reason })
             };
             let slot = *place.get(index).ok_or_else(|| wrong("is not a target of the plan"))?;
             if all[slot].status == TouchStatus::Touched {
@@ -90,14 +90,14 @@ impl ResultRequirements<'_> {
 }
 
 /// Checks a complete measurement against its plan. Call it before the measurement is accepted, because a rejected file
-/// can still be replaced. `least_found` is the fraction of the targets, from 0 to 1, that need a touched point.
+/// can still be replaced. `min_found` is the fraction of the targets, from 0 to 1, that need a touched point.
 /// `rehearsal` is true if people only act as the machines; the plan itself may then be returned as the measurement.
 /// `path` is used in messages.
 ///
 /// # Errors
 /// A measurement can be divided into several batches of touches. Returns an error in each of these cases:
 ///
-/// - Too few targets have a touched point. The first batch needs the fraction `least_found` of its targets. Each
+/// - Too few targets have a touched point. The first batch needs the fraction `min_found` of its targets. Each
 ///   further batch needs half of its targets.
 /// - The points are equal to the points of the plan, and `rehearsal` is false.
 /// - After a rigid best fit of all touched points of the part to their targets, a point is too far from its target, or
@@ -106,7 +106,7 @@ pub fn check_measurement(
     path: &Path,
     plan: &Plan,
     measurement: &Measurement,
-    least_found: f64,
+    min_found: f64,
     rehearsal: bool,
 ) -> Result<(), ExchangeError> {
     let found = measurement.points.iter().filter(|point| point.status == TouchStatus::Touched).count();
@@ -114,7 +114,7 @@ pub fn check_measurement(
     // A further batch has only a few targets, of which one may be out of reach. All batches together are checked once
     // they are there.
     let is_first = Job { job: measurement.job, cycle: measurement.cycle, digest: 0 }.batch_id().batch == 0;
-    let least = if is_first { (least_found * expected as f64).ceil() as usize } else { expected.div_ceil(2) };
+    let least = if is_first { (min_found * expected as f64).ceil() as usize } else { expected.div_ceil(2) };
     if found < least {
         return Err(ExchangeError::TooFewTargets { path: path.to_owned(), found, expected, min: least });
     }

@@ -138,8 +138,8 @@ impl DriverFactory for ExchangeWire {
         self.coordinates
     }
 
-    fn create_cmm(&self, making: &DriverContext<'_>) -> Result<Self::Cmm, DriverError> {
-        let [outbox, inbox] = self.folders(making, MachineKind::Cmm)?;
+    fn create_cmm(&self, context: &DriverContext<'_>) -> Result<Self::Cmm, DriverError> {
+        let [outbox, inbox] = self.folders(context, MachineKind::Cmm)?;
         let settings = CmmExchange {
             stable_for: Duration::from_secs_f64(self.stable_for_s),
             content: Content {
@@ -150,23 +150,23 @@ impl DriverFactory for ExchangeWire {
                 columns: self.columns.clone(),
             },
             result: Pattern::new(&*self.result),
-            stations: self.stations(making)?,
-            free_count: making.min_free_points.is_some(),
-            min_points: making.min_free_points.unwrap_or(1),
-            min_coverage: making.min_coverage,
-            rehearsal: making.rehearsal,
+            stations: self.stations(context)?,
+            free_count: context.min_free_points.is_some(),
+            min_points: context.min_free_points.unwrap_or(1),
+            min_coverage: context.min_coverage,
+            rehearsal: context.rehearsal,
             accept_earlier_files: self.accept_earlier_files,
             probe_tolerance_mm: self.probe_tolerance_mm,
             dmis_sensor: self.dmis_sensor.clone(),
-            ..CmmExchange::new(making.part, outbox, &inbox)
+            ..CmmExchange::new(context.part, outbox, &inbox)
         };
         Ok(self.machine(MachineKind::Cmm, &inbox, CmmFolders::new(settings)))
     }
 
-    fn create_grinder(&self, making: &DriverContext<'_>) -> Result<Self::Grinder, DriverError> {
-        let [outbox, inbox] = self.folders(making, MachineKind::Grinder)?;
+    fn create_grinder(&self, context: &DriverContext<'_>) -> Result<Self::Grinder, DriverError> {
+        let [outbox, inbox] = self.folders(context, MachineKind::Grinder)?;
         let stable_for = Duration::from_secs_f64(self.stable_for_s);
-        let settings = GrinderExchange { part: making.part.to_owned(), outbox, inbox: inbox.clone(), stable_for };
+        let settings = GrinderExchange { part: context.part.to_owned(), outbox, inbox: inbox.clone(), stable_for };
         Ok(self.machine(MachineKind::Grinder, &inbox, GrinderFolders::new(settings)))
     }
 }
@@ -183,10 +183,10 @@ impl ExchangeWire {
     /// # Errors
     /// Returns an error if one of the two folders does not exist. Regrind does not create them, because no machine or
     /// person would use a folder that Regrind created itself.
-    fn folders(&self, making: &DriverContext<'_>, machine: MachineKind) -> Result<[PathBuf; 2], DriverError> {
+    fn folders(&self, context: &DriverContext<'_>, machine: MachineKind) -> Result<[PathBuf; 2], DriverError> {
         let table = machine.name();
         let folder = |name: &str, path: &String| {
-            let path = making.cell_folder.join(path);
+            let path = context.cell_folder.join(path);
             match path.is_dir() {
                 true => Ok(path),
                 false => Err(DriverError::Folder { key: format!("{table}.wire.{name}"), path, machine }),
@@ -200,8 +200,8 @@ impl ExchangeWire {
     ///
     /// Reads the file of reference points now, so that an error in this file is found before the measurement begins.
     /// Returns an error if the file is not valid.
-    fn stations(&self, making: &DriverContext<'_>) -> Result<Option<Stations>, DriverError> {
-        let Some(nominal) = self.reference_points.as_ref().map(|file| making.cell_folder.join(file)) else {
+    fn stations(&self, context: &DriverContext<'_>) -> Result<Option<Stations>, DriverError> {
+        let Some(nominal) = self.reference_points.as_ref().map(|file| context.cell_folder.join(file)) else {
             return Ok(None);
         };
         let group = self.reference_group.clone();

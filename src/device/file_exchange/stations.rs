@@ -129,12 +129,12 @@ fn match_points(
         });
     }
     let (have, want) = (seen.points.len(), nominal.points.len());
-    let refuse = |why| ExchangeError::ReferenceCount {
+    let refuse = |reason| ExchangeError::ReferenceCount {
         station: station.to_owned(),
         seen: have,
         nominal: want,
         names: (0..want).map(|n| nominal.name(n)).collect::<Vec<_>>().join(", "),
-        reason: why,
+        reason,
     };
     match have {
         _ if have == want => Ok(Matching { pairs: (0..have).map(|k| (k, k)).collect() }),

@@ -79,10 +79,10 @@ struct LoggedLine<'a> {
     refused: Option<&'a str>,
 }
 
-/// Locks the state `hearing`, which the driver and the listening thread share, and returns access to it. A panic in
+/// Locks the state `session`, which the driver and the listening thread share, and returns access to it. A panic in
 /// another thread does not make this state invalid, so a poisoned lock is ignored.
-pub(super) fn locked(hearing: &Mutex<MeasurementSession>) -> MutexGuard<'_, MeasurementSession> {
-    hearing.lock().unwrap_or_else(PoisonError::into_inner)
+pub(super) fn locked(session: &Mutex<MeasurementSession>) -> MutexGuard<'_, MeasurementSession> {
+    session.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl RequestedMeasurement {
@@ -114,10 +114,10 @@ impl RequestedMeasurement {
         }
     }
 
-    fn refuse(&mut self, line: &str, why: &str) {
-        self.log_line(line, None, None, Some(why));
+    fn refuse(&mut self, line: &str, reason: &str) {
+        self.log_line(line, None, None, Some(reason));
         let shown: String = line.chars().take(80).collect();
-        self.refused_lines.push_back(format!("REFUSED line {} of the measurement, {shown:?}: {why}", self.lines));
+        self.refused_lines.push_back(format!("REFUSED line {} of the measurement, {shown:?}: {reason}", self.lines));
         if self.refused_lines.len() > MAX_REFUSED_SHOWN {
             self.refused_lines.pop_front();
         }
@@ -169,17 +169,17 @@ impl MeasurementSession {
         let read = judging.parser.read(line).map_err(|flaw| format!("{flaw}; touch this point again"));
         let hit = match read {
             Ok(hit) => hit,
-            Err(why) => return self.reject_line(line, &why),
+            Err(reason) => return self.reject_line(line, &reason),
         };
         if let Some(stands_deg) = hit.rotary_deg
             && !(stands_deg - judging.rotary_deg[0]).abs().le(&judging.rotary_deg[1])
         {
             let [wanted_deg, within_deg] = judging.rotary_deg;
-            let why = format!(
+            let reason = format!(
                 "the rotary table is at {stands_deg}°; {wanted_deg}° ± {within_deg}° is required: turn the table \
                  back, and touch the point again"
             );
-            return self.reject_line(line, &why);
+            return self.reject_line(line, &reason);
         }
         let Some(asked) = self.measurement.as_mut().filter(|_| self.state.is_moving()) else {
             return self.reject_line(line, "");
@@ -194,23 +194,23 @@ impl MeasurementSession {
                 asked.duplicate_lines += 1;
                 asked.log_line(line, None, Some("the line repeats the line before"), None);
             }
-            Err(why) => self.refuse(line, &why),
+            Err(reason) => self.refuse(line, &reason),
         }
     }
 
-    /// Processes a line that cannot be used as a touch. `why` is the reason, for the list of refused lines. The effect
-    /// depends on the state:
+    /// Processes a line that cannot be used as a touch. `reason` is the reason, for the list of refused lines. The
+    /// effect depends on the state:
     ///
     /// - While the machine may be moving, lists the line as refused. A measurement in the state EXECUTE changes to
     ///   HOLDING.
     /// - In the state HELD, lists the line as refused because it arrived too late.
     /// - In any other case, only counts the line and stores it as the last unrequested one.
-    fn reject_line(&mut self, line: &str, why: &str) {
+    fn reject_line(&mut self, line: &str, reason: &str) {
         match (&mut self.measurement, self.state) {
             (Some(asked), state) if state.is_moving() => {
                 asked.lines += 1;
                 asked.last_line = Instant::now();
-                self.refuse(line, why);
+                self.refuse(line, reason);
             }
             (Some(asked), MachineState::Held) => {
                 asked.lines += 1;
@@ -221,9 +221,9 @@ impl MeasurementSession {
         }
     }
 
-    fn refuse(&mut self, line: &str, why: &str) {
+    fn refuse(&mut self, line: &str, reason: &str) {
         if let Some(asked) = &mut self.measurement {
-            asked.refuse(line, why);
+            asked.refuse(line, reason);
         }
         if self.state == MachineState::Execute {
             self.state = MachineState::Holding;
@@ -329,80 +329,80 @@ mod tests {
     use super::*;
     use regrind_formats::result::Coordinates;
 
-    fn session(targets: u32) -> MeasurementSession {
+    fn new_session(targets: u32) -> MeasurementSession {
         let judging = LineRules {
             parser: LineParser::default(),
             rotary_deg: [0.0, 0.05],
             ignored_prefixes: vec!["PROBE".to_owned()],
         };
-        let mut hearing = MeasurementSession::new(judging);
+        let mut session = MeasurementSession::new(judging);
         let list = TargetList::new(&plan(targets), Coordinates::Centres, false, RULES);
         let job = Job { job: 7, cycle: 1, digest: 1 };
-        hearing.measurement = Some(RequestedMeasurement::new((job, 1), [0; 32], list, None));
-        hearing.state = MachineState::Execute;
-        hearing
+        session.measurement = Some(RequestedMeasurement::new((job, 1), [0; 32], list, None));
+        session.state = MachineState::Execute;
+        session
     }
 
-    fn hear(hearing: &mut MeasurementSession, line: &str) {
-        hearing.process(ReceivedLine::Line(line.to_owned()));
+    fn hear(session: &mut MeasurementSession, line: &str) {
+        session.process(ReceivedLine::Line(line.to_owned()));
     }
 
-    fn touched(hearing: &MeasurementSession) -> usize {
-        hearing.measurement.as_ref().unwrap().list.progress().0
+    fn touched(session: &MeasurementSession) -> usize {
+        session.measurement.as_ref().unwrap().list.progress().0
     }
 
     #[test]
     fn refused_line_holds_session() {
-        let mut heard = session(4);
-        hear(&mut heard, "0.000,0.000,1.500");
-        hear(&mut heard, "PROBE 1");
-        assert_eq!((heard.state, touched(&heard)), (MachineState::Execute, 1));
-        hear(&mut heard, "5.000,0.000,1.50010.000,0.000,1.500");
-        assert_eq!((heard.state, touched(&heard)), (MachineState::Holding, 1));
-        let refusals = heard.refusals();
+        let mut session = new_session(4);
+        hear(&mut session, "0.000,0.000,1.500");
+        hear(&mut session, "PROBE 1");
+        assert_eq!((session.state, touched(&session)), (MachineState::Execute, 1));
+        hear(&mut session, "5.000,0.000,1.50010.000,0.000,1.500");
+        assert_eq!((session.state, touched(&session)), (MachineState::Holding, 1));
+        let refusals = session.refusals();
         assert!(refusals[0].starts_with("REFUSED line 3 ") && refusals[0].contains("two lines are joined"));
         // The person who leads the probe does not know of the hold yet.
-        hear(&mut heard, "15.000,0.000,1.500");
-        assert_eq!((heard.state, touched(&heard)), (MachineState::Holding, 2));
-        let remaining = heard.remaining_targets();
+        hear(&mut session, "15.000,0.000,1.500");
+        assert_eq!((session.state, touched(&session)), (MachineState::Holding, 2));
+        let remaining = session.remaining_targets();
         assert!(remaining.contains("2 targets") && remaining.contains("101, 102"), "{remaining}");
         // A machine at rest touches nothing.
-        heard.state = MachineState::Held;
-        hear(&mut heard, "5.000,0.000,1.500");
-        assert_eq!((heard.state, touched(&heard)), (MachineState::Held, 2));
-        assert!(heard.refusals()[1].contains("confirm still"));
+        session.state = MachineState::Held;
+        hear(&mut session, "5.000,0.000,1.500");
+        assert_eq!((session.state, touched(&session)), (MachineState::Held, 2));
+        assert!(session.refusals()[1].contains("confirm still"));
     }
 
     #[test]
     fn session_completes_when_probe_clear() {
-        let mut heard = session(1);
-        heard.finish_if_clear(Some(Duration::ZERO));
-        assert_eq!(heard.state, MachineState::Execute);
-        hear(&mut heard, "0.000,0.000,1.500");
-        heard.finish_if_clear(None);
-        heard.finish_if_clear(Some(Duration::from_secs(3600)));
-        assert_eq!((heard.state, heard.clear_of_part), (MachineState::Execute, None));
-        heard.finish_if_clear(Some(Duration::ZERO));
+        let mut session = new_session(1);
+        session.finish_if_clear(Some(Duration::ZERO));
+        assert_eq!(session.state, MachineState::Execute);
+        hear(&mut session, "0.000,0.000,1.500");
+        session.finish_if_clear(None);
+        session.finish_if_clear(Some(Duration::from_secs(3600)));
+        assert_eq!((session.state, session.clear_of_part), (MachineState::Execute, None));
+        session.finish_if_clear(Some(Duration::ZERO));
         assert_eq!(
-            (heard.state, heard.outcome, heard.clear_of_part),
+            (session.state, session.outcome, session.clear_of_part),
             (MachineState::Complete, Outcome::Complete, Some(true))
         );
     }
 
     #[test]
     fn session_reports_rotary_and_stray_line() {
-        let mut heard = session(2);
-        heard.rules.parser.format = super::super::LineFormat::DecimalRotary;
-        hear(&mut heard, "0.000,0.000,1.500,0.0");
-        assert_eq!((heard.state, touched(&heard)), (MachineState::Execute, 1));
-        hear(&mut heard, "5.000,0.000,1.500,245.5");
-        assert_eq!((heard.state, touched(&heard)), (MachineState::Holding, 1));
-        assert!(heard.refusals()[0].contains("is at 245.5°"));
-        let mut heard = session(2);
-        heard.state = MachineState::Idle;
-        heard.measurement = None;
-        hear(&mut heard, "X1.0,Y2.0,Z3.0");
-        let told = heard.refusals().pop().unwrap();
+        let mut session = new_session(2);
+        session.rules.parser.format = super::super::LineFormat::DecimalRotary;
+        hear(&mut session, "0.000,0.000,1.500,0.0");
+        assert_eq!((session.state, touched(&session)), (MachineState::Execute, 1));
+        hear(&mut session, "5.000,0.000,1.500,245.5");
+        assert_eq!((session.state, touched(&session)), (MachineState::Holding, 1));
+        assert!(session.refusals()[0].contains("is at 245.5°"));
+        let mut session = new_session(2);
+        session.state = MachineState::Idle;
+        session.measurement = None;
+        hear(&mut session, "X1.0,Y2.0,Z3.0");
+        let told = session.refusals().pop().unwrap();
         for piece in ["\"lettered-decimal\"", "decimals = 1", "format = \"decimal\""] {
             assert!(told.contains(piece), "{told}");
         }
@@ -410,11 +410,11 @@ mod tests {
 
     #[test]
     fn link_lost_preserves_points() {
-        let mut heard = session(3);
-        hear(&mut heard, "0.000,0.000,1.500");
+        let mut session = new_session(3);
+        hear(&mut session, "0.000,0.000,1.500");
         let gone = DeviceError::Disconnected { machine: "x".into(), operation: "reading" };
-        heard.link_lost(gone, Some("5.000,0.0".to_owned()));
-        assert_eq!((heard.state, touched(&heard)), (MachineState::Holding, 1));
-        assert!(heard.refusals()[0].contains("incomplete") && heard.refusals()[1].contains("did not arrive"));
+        session.link_lost(gone, Some("5.000,0.0".to_owned()));
+        assert_eq!((session.state, touched(&session)), (MachineState::Holding, 1));
+        assert!(session.refusals()[0].contains("incomplete") && session.refusals()[1].contains("did not arrive"));
     }
 }

@@ -63,7 +63,7 @@ pub(super) struct Listener {
 
 impl Listener {
     /// Opens the connection `line` to the measuring machine and discards the data that were sent before. Then starts a
-    /// thread that receives the lines and passes each line to the shared state `hearing`. The thread ends when the
+    /// thread that receives the lines and passes each line to the shared state `session`. The thread ends when the
     /// returned handle is dropped or the connection is lost. `machine` is the name of the machine in errors, and
     /// `waits` contains the timeouts.
     ///
@@ -73,16 +73,16 @@ impl Listener {
         machine: &Arc<str>,
         line: HitSource,
         waits: LinkTimeouts,
-        hearing: Arc<Mutex<MeasurementSession>>,
+        session: Arc<Mutex<MeasurementSession>>,
     ) -> Result<Self, DeviceError> {
         let unreachable =
-            |why| DeviceError::Unreachable { machine: Arc::clone(machine), kind: why, limit: waits.connect };
+            |reason| DeviceError::Unreachable { machine: Arc::clone(machine), kind: reason, limit: waits.connect };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
         let runtime = runtime.map_err(|error| unreachable(error.kind()))?;
         let (until, ended) = oneshot::channel();
         let (opened, is_open) = oneshot::channel();
         let name = Arc::clone(machine);
-        let listen = move || runtime.block_on(listen(name, line, waits, hearing, opened, ended));
+        let listen = move || runtime.block_on(listen(name, line, waits, session, opened, ended));
         let spawned = std::thread::Builder::new().name("hit lines".into()).spawn(listen);
         spawned.map_err(|error| unreachable(error.kind()))?;
         match is_open.await {
@@ -97,7 +97,7 @@ async fn listen(
     machine: Arc<str>,
     line: HitSource,
     waits: LinkTimeouts,
-    hearing: Arc<Mutex<MeasurementSession>>,
+    session: Arc<Mutex<MeasurementSession>>,
     opened: oneshot::Sender<io::Result<()>>,
     mut ended: oneshot::Receiver<()>,
 ) {
@@ -110,7 +110,7 @@ async fn listen(
         Ok(source) => source,
         Err(error) => return drop(opened.send(Err(error))),
     };
-    locked(&hearing).link_error = None;
+    locked(&session).link_error = None;
     if opened.send(Ok(())).is_err() {
         return; // Nobody waits for it any more.
     }
@@ -126,16 +126,16 @@ async fn listen(
             None => {
                 due = None;
                 if let Some(text) = lines.give_up() {
-                    locked(&hearing).cut_short(&text);
+                    locked(&session).cut_short(&text);
                 }
             }
             Some(Ok(count)) if count > 0 => {
-                lines.push(&bytes[..count]).into_iter().for_each(|gathered| locked(&hearing).process(gathered));
+                lines.push(&bytes[..count]).into_iter().for_each(|gathered| locked(&session).process(gathered));
                 due = lines.has_partial_line().then(|| Instant::now() + waits.rest);
             }
             Some(_) => {
                 let lost = DeviceError::Disconnected { machine, operation: "listening" };
-                return locked(&hearing).link_lost(lost, lines.give_up());
+                return locked(&session).link_lost(lost, lines.give_up());
             }
         }
     }

@@ -39,21 +39,21 @@ pub struct HitLinesCmm {
 impl HitLinesCmm {
     /// Creates the driver of a machine. It does not listen yet.
     pub fn new(settings: HitLinesSettings) -> Self {
-        let hearing = Arc::new(Mutex::new(MeasurementSession::new(settings.line_rules())));
+        let session = Arc::new(Mutex::new(MeasurementSession::new(settings.line_rules())));
         let name = format!("cmm by hit lines, {}", settings.source).into();
-        Self { name, settings, session: hearing, listener: None, memory: JobMemory::new() }
+        Self { name, settings, session, listener: None, memory: JobMemory::new() }
     }
 
     fn current_status(&self) -> DeviceResult<Status> {
-        let mut hearing = locked(&self.session);
-        if let Some(error) = &hearing.link_error {
+        let mut session = locked(&self.session);
+        if let Some(error) = &session.link_error {
             return Err(error.clone());
         }
         if self.listener.is_none() {
             return Err(DeviceError::NotConnected { machine: Arc::clone(&self.name), operation: "its status" });
         }
-        hearing.finish_if_clear(self.settings.clear_after);
-        Ok(status_of(&hearing))
+        session.finish_if_clear(self.settings.clear_after);
+        Ok(status_of(&session))
     }
 
     fn refused(&self, command: MachineCommand, answer: Answer) -> DeviceError {
@@ -61,8 +61,8 @@ impl HitLinesCmm {
         DeviceError::Refused { machine: Arc::clone(&self.name), command, answer, state }
     }
 
-    fn not_accepted(&self, why: impl ToString) -> DeviceError {
-        DeviceError::NotAccepted { machine: Arc::clone(&self.name), reason: why.to_string() }
+    fn not_accepted(&self, reason: impl ToString) -> DeviceError {
+        DeviceError::NotAccepted { machine: Arc::clone(&self.name), reason: reason.to_string() }
     }
 
     /// Changes the state of the machine from one of the states in `from` to `to`. Returns the new status. `command` is
@@ -72,20 +72,20 @@ impl HitLinesCmm {
     /// Returns the refusal [`Answer::WrongState`] if the current state is not in `from`. The state then does not
     /// change.
     fn transition(&self, command: MachineCommand, from: &[MachineState], to: MachineState) -> DeviceResult<Status> {
-        let mut hearing = locked(&self.session);
-        if !from.contains(&hearing.state) {
-            drop(hearing);
+        let mut session = locked(&self.session);
+        if !from.contains(&session.state) {
+            drop(session);
             return Err(self.refused(command, Answer::WrongState));
         }
-        hearing.state = to;
-        Ok(status_of(&hearing))
+        session.state = to;
+        Ok(status_of(&session))
     }
 
     /// Returns instructions for the operator, one per line: what to do at the machine now, and which `regrind` command
-    /// to type afterwards. `hearing` is the current measurement session. Returns no lines if no measurement is
+    /// to type afterwards. `session` is the current measurement session. Returns no lines if no measurement is
     /// requested, or if the operator has nothing to do in the current state.
-    fn prompt(&self, hearing: &MeasurementSession) -> Vec<String> {
-        let Some(asked) = &hearing.measurement else { return Vec::new() };
+    fn prompt(&self, session: &MeasurementSession) -> Vec<String> {
+        let Some(asked) = &session.measurement else { return Vec::new() };
         let folder = &self.settings.run_folder;
         let run = match folder.parent() == Some(Path::new("runs")) {
             true => String::new(),
@@ -94,9 +94,9 @@ impl HitLinesCmm {
         let then = |word: &str| format!("then: regrind confirm {word} --machine cmm{run}");
         let part = &self.settings.part;
         let stop = |what: &str| {
-            vec![format!("{what} the machine at its own panel; {}", hearing.remaining_targets()), then("still")]
+            vec![format!("{what} the machine at its own panel; {}", session.remaining_targets()), then("still")]
         };
-        match hearing.state {
+        match session.state {
             MachineState::Execute if asked.list.is_complete() => match self.settings.clear_after {
                 None => vec!["every target is touched; when the probe is clear of the part,".to_owned(), then("done")],
                 Some(_) => Vec::new(),
@@ -113,7 +113,7 @@ impl HitLinesCmm {
                     format!(
                         "MEASURE {part}, cycle {}: {points} (plan {})",
                         asked.job.batch_id(),
-                        hearing.plan_digits()
+                        session.plan_digits()
                     ),
                     "check: right part, clean, clamped; wheel clear of the part; probe radius as in the plan"
                         .to_owned(),
@@ -126,7 +126,7 @@ impl HitLinesCmm {
             }
             MachineState::Holding => stop("HOLD"),
             MachineState::Stopping => stop("STOP"),
-            MachineState::Held => vec![format!("{}; to continue: regrind resume", hearing.remaining_targets())],
+            MachineState::Held => vec![format!("{}; to continue: regrind resume", session.remaining_targets())],
             MachineState::Aborting => {
                 vec!["ABORT: stop the machine at its own panel NOW; Regrind cannot stop the machine".to_owned()]
             }
@@ -134,15 +134,15 @@ impl HitLinesCmm {
         }
     }
 
-    /// Ends the measurement of the session `hearing` with the outcome COMPLETE, after a person has confirmed its end.
+    /// Ends the measurement of the session `session` with the outcome COMPLETE, after a person has confirmed its end.
     /// Returns the paths of the two stored files, relative to the folder of the run: the list of targets and the
     /// received lines.
     ///
     /// # Errors
     /// Returns the reason as text if no measurement is requested, if no point arrived, or if fewer points arrived than
     /// the setting `min_free_points`.
-    fn finish_measurement(&self, hearing: &mut MeasurementSession) -> Result<Vec<String>, String> {
-        let Some(asked) = &hearing.measurement else { return Err("no measurement is requested".to_owned()) };
+    fn finish_measurement(&self, session: &mut MeasurementSession) -> Result<Vec<String>, String> {
+        let Some(asked) = &session.measurement else { return Err("no measurement is requested".to_owned()) };
         let (there, _) = asked.list.progress();
         if let Some(least) = self.settings.min_free_points.filter(|least| there < *least) {
             return Err(format!("{there} points arrived; at least {least} are required: continue to measure"));
@@ -151,26 +151,26 @@ impl HitLinesCmm {
             return Err("no point arrived: check the cable and the settings of the machine's printer".to_owned());
         }
         let kept = vec![plan_file(asked.job), hits_file(asked.job)];
-        hearing.finish(Outcome::Complete);
-        hearing.clear_of_part = Some(true);
+        session.finish(Outcome::Complete);
+        session.clear_of_part = Some(true);
         Ok(kept)
     }
 
     fn accept_confirmation(&self, word: OperatorConfirmation) -> DeviceResult<Vec<String>> {
-        let mut hearing = locked(&self.session);
-        let taken = match (word, hearing.state) {
+        let mut session = locked(&self.session);
+        let taken = match (word, session.state) {
             (OperatorConfirmation::Done { file: Some(_), .. }, _) => {
                 Err("this machine sends its points to Regrind directly, so no file is needed: remove --file".to_owned())
             }
             (OperatorConfirmation::Done { .. }, MachineState::Execute | MachineState::Holding | MachineState::Held) => {
-                self.finish_measurement(&mut hearing)
+                self.finish_measurement(&mut session)
             }
             (OperatorConfirmation::Still, MachineState::Holding) => {
-                hearing.state = MachineState::Held;
+                session.state = MachineState::Held;
                 Ok(Vec::new())
             }
             (OperatorConfirmation::Still, MachineState::Stopping) => {
-                hearing.finish(Outcome::Stopped);
+                session.finish(Outcome::Stopped);
                 Ok(Vec::new())
             }
             (OperatorConfirmation::Started { .. }, _) => {
@@ -179,24 +179,24 @@ impl HitLinesCmm {
             }
             (_, state) => Err(format!("the machine is {state}; no confirmation of this kind is expected")),
         };
-        drop(hearing);
-        taken.map_err(|why| self.not_accepted(why))
+        drop(session);
+        taken.map_err(|reason| self.not_accepted(reason))
     }
 }
 
-fn status_of(hearing: &MeasurementSession) -> Status {
-    let asked = hearing.measurement.as_ref();
+fn status_of(session: &MeasurementSession) -> Status {
+    let asked = session.measurement.as_ref();
     let progress = asked.map(|asked| {
         let (there, of) = asked.list.progress();
         (there as u32, of.unwrap_or(there) as u32)
     });
     Status {
         job: asked.map(|asked| asked.job),
-        done: asked.filter(|_| hearing.outcome != Outcome::None).map_or(0, |asked| asked.sequence),
-        outcome: hearing.outcome,
-        clear_of_part: hearing.clear_of_part,
+        done: asked.filter(|_| session.outcome != Outcome::None).map_or(0, |asked| asked.sequence),
+        outcome: session.outcome,
+        clear_of_part: session.clear_of_part,
         progress,
-        ..Status::from_state(hearing.state)
+        ..Status::from_state(session.state)
     }
 }
 
@@ -243,8 +243,8 @@ impl Machine for HitLinesCmm {
     }
 
     fn notes(&self) -> Vec<String> {
-        let hearing = locked(&self.session);
-        hearing.refusals().into_iter().chain(self.prompt(&hearing)).collect()
+        let session = locked(&self.session);
+        session.refusals().into_iter().chain(self.prompt(&session)).collect()
     }
 
     async fn connect(&mut self) -> DeviceResult<Identity> {
@@ -286,11 +286,11 @@ impl Machine for HitLinesCmm {
         let kept = written.await.map_err(|e| self.not_accepted(e))?.map_err(|e| self.not_accepted(e))?;
         let is_free = self.settings.min_free_points.is_some();
         let list = TargetList::new(&plan, self.settings.coordinates, is_free, self.settings.touch_rules());
-        let mut hearing = locked(&self.session);
+        let mut session = locked(&self.session);
         let armed = self.memory.arm(job);
-        hearing.measurement =
+        session.measurement =
             Some(RequestedMeasurement::new((job, armed.start_sequence), plan.identity(), list, Some(kept)));
-        (hearing.state, hearing.outcome) = (MachineState::Prepared, Outcome::None);
+        (session.state, session.outcome) = (MachineState::Prepared, Outcome::None);
         Ok(armed)
     }
 
@@ -299,19 +299,19 @@ impl Machine for HitLinesCmm {
         self.current_status()?;
         let plan = self.memory.loaded.as_ref().map(|(plan, _)| Arc::clone(plan));
         let status = {
-            let mut hearing = locked(&self.session);
-            let is_prepared = hearing.state == MachineState::Prepared;
+            let mut session = locked(&self.session);
+            let is_prepared = session.state == MachineState::Prepared;
             let asked =
-                hearing.measurement.as_mut().filter(|asked| (asked.job, asked.sequence) == (job, start_sequence));
+                session.measurement.as_mut().filter(|asked| (asked.job, asked.sequence) == (job, start_sequence));
             let Some(asked) = asked.filter(|_| is_prepared) else {
-                drop(hearing);
+                drop(session);
                 return Err(self.refused(MachineCommand::Start, Answer::OtherJob));
             };
             let now = tokio::time::Instant::now();
             (asked.begun, asked.last_line) = (now, now);
             // Lines are accepted before anybody can see the list.
-            (hearing.state, hearing.clear_of_part) = (MachineState::Execute, None);
-            status_of(&hearing)
+            (session.state, session.clear_of_part) = (MachineState::Execute, None);
+            status_of(&session)
         };
         self.memory.last_start_sequence = start_sequence;
         if let Some(plan) = plan {
@@ -341,11 +341,11 @@ impl Machine for HitLinesCmm {
     async fn stop(&mut self) -> DeviceResult<Status> {
         self.current_status()?;
         if let Some((job, sequence)) = self.memory.unresolved.take() {
-            let mut hearing = locked(&self.session);
+            let mut session = locked(&self.session);
             let list = TargetList::new(&no_plan(), self.settings.coordinates, false, self.settings.touch_rules());
-            hearing.measurement = Some(RequestedMeasurement::new((job, sequence), [0; 32], list, None));
-            hearing.state = MachineState::Stopping;
-            return Ok(status_of(&hearing));
+            session.measurement = Some(RequestedMeasurement::new((job, sequence), [0; 32], list, None));
+            session.state = MachineState::Stopping;
+            return Ok(status_of(&session));
         }
         let state = locked(&self.session).state;
         match state {
@@ -355,9 +355,9 @@ impl Machine for HitLinesCmm {
             }
             // A person has confirmed that it does not move.
             MachineState::Held => {
-                let mut hearing = locked(&self.session);
-                hearing.finish(Outcome::Stopped);
-                Ok(status_of(&hearing))
+                let mut session = locked(&self.session);
+                session.finish(Outcome::Stopped);
+                Ok(status_of(&session))
             }
             _ => self.transition(
                 MachineCommand::Stop,
@@ -369,11 +369,11 @@ impl Machine for HitLinesCmm {
 
     async fn abort(&mut self) -> DeviceResult<Status> {
         let untold = self.memory.unresolved.take();
-        let mut hearing = locked(&self.session);
-        let may_move = hearing.state.is_moving() || untold.is_some();
-        hearing.state = if may_move { MachineState::Aborting } else { MachineState::Aborted };
-        hearing.outcome = Outcome::Aborted;
-        Ok(status_of(&hearing))
+        let mut session = locked(&self.session);
+        let may_move = session.state.is_moving() || untold.is_some();
+        session.state = if may_move { MachineState::Aborting } else { MachineState::Aborted };
+        session.outcome = Outcome::Aborted;
+        Ok(status_of(&session))
     }
 
     async fn clear(&mut self) -> DeviceResult<Status> {
@@ -388,9 +388,9 @@ impl Machine for HitLinesCmm {
             return Err(self.refused(MachineCommand::Acknowledge, Answer::OtherResult));
         }
         self.transition(MachineCommand::Acknowledge, &[MachineState::Complete], MachineState::Idle)?;
-        let mut hearing = locked(&self.session);
-        hearing.forget();
-        Ok(status_of(&hearing))
+        let mut session = locked(&self.session);
+        session.forget();
+        Ok(status_of(&session))
     }
 
     async fn release(&mut self) -> DeviceResult<Status> {
@@ -402,13 +402,13 @@ impl Machine for HitLinesCmm {
 
     async fn reconcile(&mut self, intended: &Armed) -> DeviceResult<Reconciled> {
         self.current_status()?;
-        let hearing = locked(&self.session);
-        let ours = hearing.measurement.as_ref().map(|asked| (asked.job, asked.sequence))
+        let session = locked(&self.session);
+        let ours = session.measurement.as_ref().map(|asked| (asked.job, asked.sequence))
             == Some((intended.job, intended.start_sequence));
-        Ok(match hearing.state {
-            MachineState::Complete | MachineState::Aborted if ours => Reconciled::Finished(status_of(&hearing)),
+        Ok(match session.state {
+            MachineState::Complete | MachineState::Aborted if ours => Reconciled::Finished(status_of(&session)),
             state if ours && (state.is_moving() || state == MachineState::Held) => {
-                Reconciled::Running(status_of(&hearing))
+                Reconciled::Running(status_of(&session))
             }
             _ => Reconciled::Unknown {
                 reason: "the machine does not report the outcome of the job; ask the person at the machine whether the job was done".to_owned(),
@@ -442,27 +442,27 @@ impl Cmm for HitLinesCmm {
     }
 
     async fn read_ahead(&mut self, job: Job, _: &Interrupt) -> Option<PreliminaryPoints> {
-        let hearing = locked(&self.session);
-        let asked = hearing.measurement.as_ref().filter(|asked| asked.job == job)?;
+        let session = locked(&self.session);
+        let asked = session.measurement.as_ref().filter(|asked| asked.job == job)?;
         let (from, points) = (self.memory.reported_points, asked.list.ready(self.memory.reported_points));
-        drop(hearing);
+        drop(session);
         self.memory.reported_points += points.len();
         let there = !points.is_empty();
         there.then_some(PreliminaryPoints { job, first_index: from, points, coordinates: self.settings.coordinates })
     }
 
     async fn collect(&mut self, job: Job, _: &Interrupt) -> DeviceResult<Measurement> {
-        let hearing = locked(&self.session);
-        let complete = hearing.state == MachineState::Complete && hearing.outcome == Outcome::Complete;
-        let Some(asked) = hearing.measurement.as_ref().filter(|asked| asked.job == job && complete) else {
-            return Err(DeviceError::NoResult { machine: Arc::clone(&self.name), job, state: hearing.state });
+        let session = locked(&self.session);
+        let complete = session.state == MachineState::Complete && session.outcome == Outcome::Complete;
+        let Some(asked) = session.measurement.as_ref().filter(|asked| asked.job == job && complete) else {
+            return Err(DeviceError::NoResult { machine: Arc::clone(&self.name), job, state: session.state });
         };
         Ok(Measurement {
             points: asked.list.points(),
             coordinates: self.settings.coordinates,
             probe_radius_mm: None,
             temperature_c: None,
-            duration_s: Some(hearing.duration.as_secs_f64()),
+            duration_s: Some(session.duration.as_secs_f64()),
             plan_identity: asked.plan_identity,
             job: job.job,
             cycle: job.cycle,

@@ -139,8 +139,8 @@ pub struct LineError {
 }
 
 impl LineError {
-    pub(super) fn whole_line(why: impl Into<String>) -> Self {
-        Self { value: 0, reason: why.into() }
+    pub(super) fn whole_line(reason: impl Into<String>) -> Self {
+        Self { value: 0, reason: reason.into() }
     }
 }
 
@@ -162,8 +162,8 @@ impl LineParser {
     /// exceeds its limit.
     pub fn read(&self, line: &str) -> Result<Hit, LineError> {
         if let Some((at, c)) = line.chars().enumerate().find(|(_, c)| !matches!(c, '\t' | ' '..='~')) {
-            let why = format!("character {} of the line is {c:?}, which is not plain text", at + 1);
-            return Err(LineError::whole_line(why));
+            let reason = format!("character {} of the line is {c:?}, which is not plain text", at + 1);
+            return Err(LineError::whole_line(reason));
         }
         let fields = self.fields(line)?;
         let mut at_mm = [0.0; 3];
@@ -183,12 +183,12 @@ impl LineParser {
             Separator::Blank => line.split(' ').filter(|field| !field.is_empty()).collect(),
         };
         let expected = if self.format.has_rotary() { 4 } else { 3 };
-        let why = match fields.len() {
+        let reason = match fields.len() {
             found if found < expected => "the line is incomplete, or has another format",
             found if found > expected => "two lines are joined, or the line has another format",
             _ => return Ok(fields),
         };
-        Err(LineError::whole_line(format!("the line has {} values instead of {expected}: {why}", fields.len())))
+        Err(LineError::whole_line(format!("the line has {} values instead of {expected}: {reason}", fields.len())))
     }
 
     /// Returns the number in `field` as text, without blanks and without the axis letter. `field` is the text between
@@ -208,7 +208,7 @@ impl LineParser {
 
     fn coordinate(&self, k: usize, field: &str) -> Result<f64, LineError> {
         let number = self.number(k, field)?;
-        let flaw = |why: String| LineError { value: k + 1, reason: format!("is {field:?}, {why}") };
+        let flaw = |reason: String| LineError { value: k + 1, reason: format!("is {field:?}, {reason}") };
         let (digits, scale_mm) = match self.format.is_integer() {
             true => (0, 1e-3),
             false => (self.decimals, self.unit_mm),
@@ -226,7 +226,7 @@ impl LineParser {
 
     fn angle(&self, field: &str) -> Result<f64, LineError> {
         let number = self.number(3, field)?;
-        let flaw = |why: &str| LineError { value: 4, reason: format!("is {field:?}, {why}") };
+        let flaw = |reason: &str| LineError { value: 4, reason: format!("is {field:?}, {reason}") };
         let angle = match self.format.is_integer() {
             true => exact(number, self.mark, 0, 0).map(|tenths| tenths / 10.0),
             false => exact(number, self.mark, 1, MAX_DIGITS),
@@ -337,7 +337,7 @@ mod tests {
     #[test]
     fn line_parser_refuses_damaged_line() {
         let reading = LineParser::default();
-        for (line, why) in [
+        for (line, reason) in [
             ("100.000,200.000", "the line has 2 values instead of 3: the line is incomplete"),
             ("100.000,200.000,300.00", "value 3 of the line is \"300.00\", but must be a number with 3 digits"),
             ("100.000,200.000,300.000100.000,200.000,300.000", "the line has 5 values instead of 3: two lines"),
@@ -355,7 +355,7 @@ mod tests {
             ("", "the line has 1 values"),
         ] {
             let flaw = reading.read(line).unwrap_err().to_string();
-            assert!(flaw.contains(why), "{line:?}: {flaw}");
+            assert!(flaw.contains(reason), "{line:?}: {flaw}");
         }
         let lettered = LineParser { format: LineFormat::LetteredDecimal, ..reading };
         for line in ["X1.000,Z2.000,Y3.000", "1.000,2.000,3.000", "X1.000,Y2.000,Z3.000,W1.0"] {

@@ -250,19 +250,19 @@ impl DriverFactory for HitLinesWire {
         self.coordinates
     }
 
-    fn create_cmm(&self, making: &DriverContext<'_>) -> Result<HitLinesCmm, DriverError> {
+    fn create_cmm(&self, context: &DriverContext<'_>) -> Result<HitLinesCmm, DriverError> {
         if let Some(missing) = self.missing() {
             return Err(DriverError::NoPort { missing });
         }
-        let plan_folder = self.plan_folder.as_ref().map(|folder| making.cell_folder.join(folder));
+        let plan_folder = self.plan_folder.as_ref().map(|folder| context.cell_folder.join(folder));
         if let Some(path) = plan_folder.as_ref().filter(|path| !path.is_dir()) {
             let machine = crate::MachineKind::Cmm;
             return Err(DriverError::Folder { key: "cmm.wire.plan_folder".to_owned(), path: path.clone(), machine });
         }
         let ms = |ms: u32| Duration::from_millis(ms.into());
         Ok(HitLinesCmm::new(HitLinesSettings {
-            part: making.part.to_owned(),
-            run_folder: making.run_folder.to_owned(),
+            part: context.part.to_owned(),
+            run_folder: context.run_folder.to_owned(),
             plan_folder,
             source: self.source(),
             parser: self.parser(),
@@ -275,10 +275,10 @@ impl DriverFactory for HitLinesWire {
             line_timeout: ms(self.line_timeout_ms),
             ignored_prefixes: self.ignored_prefixes.clone(),
             clear_after: self.clear_after_s.map(Duration::from_secs_f64),
-            min_free_points: making.min_free_points,
-            connect_timeout: making.timing.lost_after,
-            silence: making.timing.quarantine,
-            simulated: making.simulated,
+            min_free_points: context.min_free_points,
+            connect_timeout: context.timing.lost_after,
+            silence: context.timing.quarantine,
+            simulated: context.simulated,
         }))
     }
 

@@ -55,9 +55,9 @@ pub(super) enum TouchAssignment {
 
 impl TargetList {
     /// Creates the list of the targets of `plan`, without any touch. `what` states whether the received coordinates are
-    /// centres of the probe ball or contact points on the surface. `telling` contains the rules that assign a touch to
+    /// centres of the probe ball or contact points on the surface. `rules` contains the rules that assign a touch to
     /// a target. If `is_free` is true, the list has no targets and accepts every point.
-    pub(super) fn new(plan: &Plan, what: Coordinates, is_free: bool, telling: TouchRules) -> Self {
+    pub(super) fn new(plan: &Plan, what: Coordinates, is_free: bool, rules: TouchRules) -> Self {
         let reach_mm = if what == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
         let targets = if is_free { &[][..] } else { &plan.targets[..] };
         let expected = |k: usize| std::array::from_fn(|i| targets[k].point_mm[i] + reach_mm * targets[k].normal[i]);
@@ -65,7 +65,7 @@ impl TargetList {
             expected_mm: (0..targets.len()).map(expected).collect(),
             indices: targets.iter().map(|target| target.index).collect(),
             points: vec![None; targets.len()],
-            rules: telling,
+            rules,
             last: None,
         }
     }
@@ -78,7 +78,7 @@ impl TargetList {
     /// line `line`, in mm. `came` is the time from the start of the measurement to the arrival of this line. Returns
     /// the index of the target, and whether this is its first touch or a replacement.
     ///
-    /// If the same line as the previous one arrives within the time `double_within` of the touch rules, returns
+    /// If the same line as the previous one arrives within the time `duplicate_window` of the touch rules, returns
     /// `TouchAssignment::DuplicateLine` and stores nothing. If the list has no targets and accepts every point, stores
     /// the point with the next free index.
     ///
@@ -231,8 +231,8 @@ pub(super) mod tests {
         assert!(repeated.contains("target 100 was already touched, 0.0000 mm"), "{repeated}");
         assert!(list.assign("b", [0.01, 0.0, 1.5], at(601)).unwrap_err().contains("the first touch remains valid"));
         assert_eq!(list.points()[0].position_mm, centre);
-        let telling = TouchRules { repeated: Repeated::Replace, ..RULES };
-        let mut list = TargetList::new(&plan(2), Coordinates::Centres, false, telling);
+        let rules = TouchRules { repeated: Repeated::Replace, ..RULES };
+        let mut list = TargetList::new(&plan(2), Coordinates::Centres, false, rules);
         assert_eq!(list.assign("a", centre, at(0)), Ok(TouchAssignment::First(100)));
         assert_eq!(list.assign("b", [0.01, 0.0, 1.5], at(1)), Ok(TouchAssignment::Repeated(100)));
         assert_eq!(list.points()[0].position_mm, [0.01, 0.0, 1.5]);

@@ -58,7 +58,7 @@ impl DmeCommand {
     }
 
     fn untagged(reader: &mut Reader<'_>) -> Result<Self, SyntaxError> {
-        let illegal = |why| SyntaxError { number: 507, reason: why };
+        let illegal = |reason| SyntaxError { number: 507, reason };
         let text = reader.rest();
         let end = text.bytes().position(|b| !b.is_ascii_alphanumeric()).unwrap_or(text.len());
         let name = &text[..end];

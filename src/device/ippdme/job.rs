@@ -178,7 +178,7 @@ impl Worker {
     /// implausible answer, the state becomes FAULTED. After a failed connection, the state stays the same and the error
     /// is stored as the end of the session. Returns true if the connection failed, otherwise false.
     fn failed(&mut self, failure: Failure) -> bool {
-        let why = self.device_error(&failure);
+        let reason = self.device_error(&failure);
         self.position_mm = None;
         let mut shared = locked(&self.shared);
         shared.clear_of_part = None;
@@ -188,7 +188,7 @@ impl Worker {
                 return false;
             }
             Failure::Link(_) => {
-                shared.session_error = Some(why);
+                shared.session_error = Some(reason);
                 return true;
             }
             Failure::Refused(error) => shared.fault = fault(error.number),
@@ -196,7 +196,7 @@ impl Worker {
         }
         let of_job = shared.state.is_moving() || shared.state == MachineState::Held;
         shared.outcome = if of_job { Outcome::Failed } else { shared.outcome };
-        (shared.state, shared.stop_reason) = (MachineState::Faulted, Some(why.to_string()));
+        (shared.state, shared.stop_reason) = (MachineState::Faulted, Some(reason.to_string()));
         false
     }
 

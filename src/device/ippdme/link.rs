@@ -120,7 +120,7 @@ impl Session {
         (aborts, aborted): (watch::Receiver<u64>, u64),
     ) -> Result<Self, DeviceError> {
         let unreachable =
-            |why| DeviceError::Unreachable { machine: Arc::clone(&machine), kind: why, limit: limits.answer };
+            |reason| DeviceError::Unreachable { machine: Arc::clone(&machine), kind: reason, limit: limits.answer };
         let dialled = timeout(limits.answer, dial.connect(line)).await;
         let stream = dialled.unwrap_or(Err(std::io::ErrorKind::TimedOut.into())).map_err(|e| unreachable(e.kind()))?;
         Ok(Self::from_stream(aborted, Arc::clone(&machine), Box::new(stream), limits, aborts))
@@ -405,9 +405,9 @@ impl Session {
             match response.content {
                 ResponseContent::Complete if response.tag == tag => return Ok(()),
                 ResponseContent::Error(error) if response.tag == tag && !is_harmless(&error) && !may_refuse => {
-                    let why = "it does not execute AbortE";
+                    let reason = "it does not execute AbortE";
                     self.note(format!("AbortE: {error}"));
-                    return Err(Failure::Link(self.unreadable(error.to_string(), why)));
+                    return Err(Failure::Link(self.unreadable(error.to_string(), reason)));
                 }
                 _ => {}
             }
@@ -455,9 +455,9 @@ impl Session {
         DeviceError::Disconnected { machine: Arc::clone(&self.machine), operation: what }
     }
 
-    fn unreadable(&self, line: String, why: &'static str) -> DeviceError {
+    fn unreadable(&self, line: String, reason: &'static str) -> DeviceError {
         let line = line.chars().take(120).collect();
-        DeviceError::Unreadable { machine: Arc::clone(&self.machine), line, reason: why }
+        DeviceError::Unreadable { machine: Arc::clone(&self.machine), line, reason }
     }
 }
 

@@ -279,8 +279,8 @@ impl Machine for IppdmeCmm {
             let Route { travel_m, plan_order_m: plain_m, .. } = work.route;
             format!("the travel between targets is {travel_m:.2} m; in the order of the plan, the travel would be {plain_m:.2} m")
         });
-        let why = shared.stop_reason.iter().cloned();
-        why.chain(shared.notes.iter().cloned()).chain(way).collect()
+        let reason = shared.stop_reason.iter().cloned();
+        reason.chain(shared.notes.iter().cloned()).chain(way).collect()
     }
 
     async fn connect(&mut self) -> DeviceResult<Identity> {
@@ -465,8 +465,8 @@ impl Machine for IppdmeCmm {
             (shared.stop_reason, shared.clear_of_part) = (Some(gone.to_owned()), None);
             return Ok(Reconciled::Finished(self.status_of(&shared)));
         }
-        let why = "an I++ DME server does not store a job, and Regrind has no record of a job with this START number: check at the machine whether the job was done".to_owned();
-        Ok(Reconciled::Unknown { reason: why })
+        let reason = "an I++ DME server does not store a job, and Regrind has no record of a job with this START number: check at the machine whether the job was done".to_owned();
+        Ok(Reconciled::Unknown { reason })
     }
 }
 

@@ -63,7 +63,7 @@ impl DmeResponse {
     /// # Errors
     /// The line is none of these.
     pub fn read(line: &str) -> Result<Self, SyntaxError> {
-        let none = |why| SyntaxError { number: 8, reason: why };
+        let none = |reason| SyntaxError { number: 8, reason };
         let tag = line.get(..5).and_then(Tag::read).ok_or(none("no tag"))?;
         let rest = line[5..].trim_start_matches(' ');
         let mut characters = rest.chars();

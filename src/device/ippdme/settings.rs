@@ -160,9 +160,9 @@ impl DriverFactory for IppdmeWire {
         }
     }
 
-    fn create_cmm(&self, making: &DriverContext<'_>) -> Result<IppdmeCmm, DriverError> {
+    fn create_cmm(&self, context: &DriverContext<'_>) -> Result<IppdmeCmm, DriverError> {
         let machine = format!("cmm at {}:{}", self.host, self.port);
-        let volume_mm = making.volume_mm.ok_or(DriverError::NoVolume { machine })?;
+        let volume_mm = context.volume_mm.ok_or(DriverError::NoVolume { machine })?;
         let ms = |ms: u32| Duration::from_millis(ms.into());
         Ok(IppdmeCmm::new(IppdmeSettings {
             host: self.host.clone(),
@@ -181,9 +181,9 @@ impl DriverFactory for IppdmeWire {
                 after_abort: ms(self.delay_after_abort_ms),
                 alive: ms(self.alive_every_ms),
             },
-            silence_limit: making.timing.lost_after,
-            expected_name: making.expected_name.map(str::to_owned),
-            simulated: making.simulated,
+            silence_limit: context.timing.lost_after,
+            expected_name: context.expected_name.map(str::to_owned),
+            simulated: context.simulated,
         }))
     }
 

@@ -49,14 +49,14 @@ pub struct SyntaxError {
     pub reason: &'static str,
 }
 
-/// Returns the error 502, "incorrect arguments", with the reason `why`.
-pub(super) const fn arguments(why: &'static str) -> SyntaxError {
-    SyntaxError { number: 502, reason: why }
+/// Returns the error 502, "incorrect arguments", with the reason `reason`.
+pub(super) const fn arguments(reason: &'static str) -> SyntaxError {
+    SyntaxError { number: 502, reason }
 }
 
-/// Returns the error 509, "bad argument", with the reason `why`.
-pub(super) const fn bad(why: &'static str) -> SyntaxError {
-    SyntaxError { number: 509, reason: why }
+/// Returns the error 509, "bad argument", with the reason `reason`.
+pub(super) const fn bad(reason: &'static str) -> SyntaxError {
+    SyntaxError { number: 509, reason }
 }
 
 /// Argument or data item, between two commas.

@@ -382,7 +382,7 @@ impl Controller {
     fn fault(&self, fault: LinkFault, what: &'static str) -> DeviceError {
         let (machine, limit) = (self.machine(), self.settings.answer_timeout);
         match fault {
-            LinkFault::Unreachable(why) => DeviceError::Unreachable { machine, kind: why, limit },
+            LinkFault::Unreachable(reason) => DeviceError::Unreachable { machine, kind: reason, limit },
             LinkFault::TimedOut => DeviceError::TimedOut { machine, operation: what, limit },
             LinkFault::Disconnected => DeviceError::Disconnected { machine, operation: what },
             LinkFault::NotProtocol => {

@@ -53,7 +53,7 @@ impl Folders {
         let pass = read_bytes(file).map_err(|error| error.to_string())?;
         let run = self.run.file_name().unwrap_or_default().to_string_lossy();
         let order = ProgramInputs { run: &run, cycle, pass: &pass, map, rounds, folder: &self.remote };
-        FramedProgram::frame(order).map_err(|why| format!("{}: {why}", file.display()))
+        FramedProgram::frame(order).map_err(|reason| format!("{}: {reason}", file.display()))
     }
 
     /// Writes `program` into the folder of programs, which this computer and the controller both see. Then reads the

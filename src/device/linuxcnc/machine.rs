@@ -190,9 +190,9 @@ impl Machine for LinuxcncGrinder {
                 self.job = None;
                 Err(refused)
             }
-            Err(why) => {
-                let (machine, why) = (self.machine(), Box::new(why));
-                Err(DeviceError::StartUnknown { machine, job, sequence: start_sequence, cause: why })
+            Err(reason) => {
+                let (machine, reason) = (self.machine(), Box::new(reason));
+                Err(DeviceError::StartUnknown { machine, job, sequence: start_sequence, cause: reason })
             }
         }
     }
@@ -318,7 +318,7 @@ impl Machine for LinuxcncGrinder {
         if !self.is_unresolved().await? {
             return Err(DeviceError::ConfirmationNotNeeded { machine: self.machine() });
         }
-        let not_taken = |why: &str| DeviceError::NotAccepted { machine: self.machine(), reason: why.to_owned() };
+        let not_taken = |reason: &str| DeviceError::NotAccepted { machine: self.machine(), reason: reason.to_owned() };
         let program = self.job.as_ref().and_then(|work| work.program.clone());
         let ended = match word {
             OperatorConfirmation::Started { .. } => {
@@ -464,7 +464,7 @@ impl LinuxcncGrinder {
             Ok(done) => done.unwrap_or_else(|error| Err(error.to_string())),
             Err(_) => Err(format!("{} did not answer within 30 s", self.folders.local.display())),
         };
-        done.map_err(|why| DeviceError::Folder { machine: self.machine(), reason: why })
+        done.map_err(|reason| DeviceError::Folder { machine: self.machine(), reason })
     }
 
     /// Returns the content of the log file that the program of the job `work` wrote. Returns `None` if the program is

@@ -150,8 +150,8 @@ impl DriverFactory for LinuxcncWire {
         Err(DriverError::NoDriver { table: "cmm", kind: "linuxcnc" })
     }
 
-    fn create_grinder(&self, making: &DriverContext<'_>) -> Result<LinuxcncGrinder, DriverError> {
-        let programs = making.cell_folder.join(&self.programs);
+    fn create_grinder(&self, context: &DriverContext<'_>) -> Result<LinuxcncGrinder, DriverError> {
+        let programs = context.cell_folder.join(&self.programs);
         let programs = std::path::absolute(&programs).unwrap_or(programs);
         if !programs.is_dir() {
             let (key, machine) = ("grinder.wire.programs".to_owned(), MachineKind::Grinder);
@@ -164,15 +164,15 @@ impl DriverFactory for LinuxcncWire {
             port: self.port,
             connect_password: self.connect_password.clone(),
             control_password: self.control_password.clone(),
-            run_folder: making.run_folder.to_owned(),
+            run_folder: context.run_folder.to_owned(),
             programs_at_controller: at_controller.unwrap_or_else(|| programs.display().to_string()),
             programs,
-            simulated: making.simulated,
+            simulated: context.simulated,
             joints: self.joints.into(),
             answer_timeout: ms(self.answer_timeout_ms),
             settle_timeout: ms(self.settle_timeout_ms),
             record_timeout: ms(self.record_timeout_ms),
-            expected_name: making.expected_name.map(str::to_owned),
+            expected_name: context.expected_name.map(str::to_owned),
         }))
     }
 

@@ -121,8 +121,8 @@ impl ManualMachine {
         DeviceError::Refused { machine: Arc::clone(&self.name), command, answer, state: self.state }
     }
 
-    fn not_accepted(&self, why: impl ToString) -> DeviceError {
-        DeviceError::NotAccepted { machine: Arc::clone(&self.name), reason: why.to_string() }
+    fn not_accepted(&self, reason: impl ToString) -> DeviceError {
+        DeviceError::NotAccepted { machine: Arc::clone(&self.name), reason: reason.to_string() }
     }
 
     /// Changes the state of the machine from one of the states in `from` to `to`. Returns the new status. `command` is
@@ -263,8 +263,8 @@ impl ManualMachine {
                 Ok(Vec::new())
             }
             _ => {
-                let why = format!("the machine is in the state {}, which does not allow this confirmation", self.state);
-                Err(self.not_accepted(why))
+                let reason = format!("the machine is in the state {}, which does not allow this confirmation", self.state);
+                Err(self.not_accepted(reason))
             }
         }
     }
@@ -363,8 +363,8 @@ fn read_measurement(
     };
     let identity = plan.identity();
     let file = wanted.read(path, bytes)?;
-    if let Some(why) = contradiction(&file.statements, &settings.part, job.cycle, &hex(&identity)) {
-        return Err(ExchangeError::Foreign { path: path.to_owned(), reason: why });
+    if let Some(reason) = contradiction(&file.statements, &settings.part, job.cycle, &hex(&identity)) {
+        return Err(ExchangeError::Foreign { path: path.to_owned(), reason });
     }
     let points = wanted.assign_by_index(path, &file)?;
     if let Some(expected) = settings.min_free_points.filter(|least| points.len() < *least) {

@@ -54,20 +54,20 @@ impl DriverFactory for ManualWire {
         self.coordinates
     }
 
-    fn create_cmm(&self, making: &DriverContext<'_>) -> Result<ManualMachine, DriverError> {
-        Ok(ManualMachine::new(MachineKind::Cmm, self.settings(making)))
+    fn create_cmm(&self, context: &DriverContext<'_>) -> Result<ManualMachine, DriverError> {
+        Ok(ManualMachine::new(MachineKind::Cmm, self.settings(context)))
     }
 
-    fn create_grinder(&self, making: &DriverContext<'_>) -> Result<ManualMachine, DriverError> {
-        Ok(ManualMachine::new(MachineKind::Grinder, self.settings(making)))
+    fn create_grinder(&self, context: &DriverContext<'_>) -> Result<ManualMachine, DriverError> {
+        Ok(ManualMachine::new(MachineKind::Grinder, self.settings(context)))
     }
 }
 
 impl ManualWire {
-    fn settings(&self, making: &DriverContext<'_>) -> ManualSettings {
+    fn settings(&self, context: &DriverContext<'_>) -> ManualSettings {
         ManualSettings {
-            part: making.part.to_owned(),
-            run_folder: making.run_folder.to_owned(),
+            part: context.part.to_owned(),
+            run_folder: context.run_folder.to_owned(),
             content: Content {
                 coordinates: self.coordinates,
                 decimal: self.decimal,
@@ -75,9 +75,9 @@ impl ManualWire {
                 height_unit: self.height_unit,
                 columns: self.columns.clone(),
             },
-            min_free_points: making.min_free_points,
-            min_coverage: making.min_coverage,
-            rehearsal: making.rehearsal,
+            min_free_points: context.min_free_points,
+            min_coverage: context.min_coverage,
+            rehearsal: context.rehearsal,
             probe_tolerance_mm: self.probe_tolerance_mm,
         }
     }

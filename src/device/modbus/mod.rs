@@ -484,8 +484,12 @@ impl ModbusMachine {
             token,
             argument: 0,
         };
-        let unknown =
-            |machine, why| DeviceError::StartUnknown { machine, job, sequence: start_sequence, cause: Box::new(why) };
+        let unknown = |machine, reason| DeviceError::StartUnknown {
+            machine,
+            job,
+            sequence: start_sequence,
+            cause: Box::new(reason),
+        };
         match self.send_command(frame).await {
             Ok(status) if status.begun_by == start_sequence && status.job == Some(job) => {
                 Ok(Started { job, start_sequence, status: status.into() })
@@ -500,7 +504,7 @@ impl ModbusMachine {
             Err(DeviceError::NotConnected { machine, operation: what }) => {
                 Err(DeviceError::NotConnected { machine, operation: what })
             }
-            Err(why) => Err(unknown(self.machine(), why)),
+            Err(reason) => Err(unknown(self.machine(), reason)),
         }
     }
 
@@ -1002,7 +1006,7 @@ struct Header {
 /// `None` with a second, later status.
 fn start_outcome(intended: &Armed, status: &StatusBlock) -> Option<Reconciled> {
     let Armed { job, start_sequence, boot_id, .. } = *intended;
-    let unknown = |why: String| Some(Reconciled::Unknown { reason: why });
+    let unknown = |reason: String| Some(Reconciled::Unknown { reason });
     if status.boot_id != boot_id {
         let is = status.boot_id;
         return unknown(format!(

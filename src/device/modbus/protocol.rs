@@ -280,11 +280,11 @@ impl Payload for CorrectionMap {
     const NAME: &'static str = "correction map";
 
     fn words(&self, order: WordOrder) -> Vec<u16> {
-        let largest_mm = self.values_mm.iter().fold(0.0, |most: f64, value| most.max(value.abs()));
+        let max_mm = self.values_mm.iter().fold(0.0, |most: f64, value| most.max(value.abs()));
         let Grid { columns, rows, first_mm, spacing_mm } = self.grid;
         let mut map = Writer::new(order);
         map.u16(1).u16(1).u32(columns as u32).u32(rows as u32).u32(0);
-        map.f64s(&first_mm).f64s(&spacing_mm).f64(largest_mm).zeros(4).identity(&self.part_identity);
+        map.f64s(&first_mm).f64s(&spacing_mm).f64(max_mm).zeros(4).identity(&self.part_identity);
         map.f64s(&self.values_mm);
         map.finish()
     }

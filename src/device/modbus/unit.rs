@@ -273,7 +273,9 @@ impl ModbusUnit {
         }
         self.verified_generation = None;
         match fault {
-            LinkFault::Unreachable(why) => DeviceError::Unreachable { machine, kind: why, limit: self.lost_after },
+            LinkFault::Unreachable(reason) => {
+                DeviceError::Unreachable { machine, kind: reason, limit: self.lost_after }
+            }
             LinkFault::TimedOut => {
                 DeviceError::TimedOut { machine, operation: what, limit: self.link.request_timeout() }
             }

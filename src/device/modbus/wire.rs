@@ -25,13 +25,13 @@ macro_rules! modbus_wire {
                 self.missing().into_iter().collect()
             }
 
-            fn create_cmm(&self, making: &DriverContext<'_>) -> Result<ModbusCmm, DriverError> {
-                let (link, settings) = link(self.line(), self.unit, self.missing(), making)?;
+            fn create_cmm(&self, context: &DriverContext<'_>) -> Result<ModbusCmm, DriverError> {
+                let (link, settings) = link(self.line(), self.unit, self.missing(), context)?;
                 Ok(ModbusCmm::on(link, settings))
             }
 
-            fn create_grinder(&self, making: &DriverContext<'_>) -> Result<ModbusGrinder, DriverError> {
-                let (link, settings) = link(self.line(), self.unit, self.missing(), making)?;
+            fn create_grinder(&self, context: &DriverContext<'_>) -> Result<ModbusGrinder, DriverError> {
+                let (link, settings) = link(self.line(), self.unit, self.missing(), context)?;
                 Ok(ModbusGrinder::on(link, settings))
             }
 
@@ -51,29 +51,29 @@ modbus_wire!(RtuWire);
 
 impl ModbusSettings {
     /// Returns the settings of the driver for the machine with the number `unit` on `line`. All other values, such as
-    /// timeouts, register addresses and signals, come from `making`.
-    pub fn from_context(line: LineAddress, unit: u8, making: &DriverContext<'_>) -> Self {
-        let timing = making.timing;
+    /// timeouts, register addresses and signals, come from `context`.
+    pub fn from_context(line: LineAddress, unit: u8, context: &DriverContext<'_>) -> Self {
+        let timing = context.timing;
         Self {
             unit,
-            registers: *making.registers,
+            registers: *context.registers,
             request_timeout: timing.request_timeout,
             retries: u32::from(timing.retries),
             lost_after: timing.lost_after,
             quarantine: timing.quarantine,
-            owner: making.owner,
-            epoch: making.epoch,
-            signals: making.signals.to_vec(),
+            owner: context.owner,
+            epoch: context.epoch,
+            signals: context.signals.to_vec(),
             heartbeat_interval: timing.heartbeat,
-            expected_name: making.expected_name.map(str::to_owned),
-            simulation: Some(making.simulated),
+            expected_name: context.expected_name.map(str::to_owned),
+            simulation: Some(context.simulated),
             ..Self::new(line)
         }
     }
 }
 
 /// Returns the Modbus line of the machine with the number `unit`, and all settings of its driver. `line` is the address
-/// of the line. `making` contains the settings from the cell file and the line of the other machine, if this machine
+/// of the line. `context` contains the settings from the cell file and the line of the other machine, if this machine
 /// exists already. If both lines have the same address, both machines share one line. Otherwise a new line is created.
 ///
 /// `missing` is a message that the serial port does not exist. It is `None` if no such problem was found.
@@ -84,13 +84,13 @@ fn link(
     line: LineAddress,
     unit: u8,
     missing: Option<String>,
-    making: &DriverContext<'_>,
+    context: &DriverContext<'_>,
 ) -> Result<(Link, ModbusSettings), DriverError> {
     if let Some(missing) = missing {
         return Err(DriverError::NoPort { missing });
     }
-    let settings = ModbusSettings::from_context(line, unit, making);
-    let link = match making.shared_link.filter(|link| *link.line() == settings.line) {
+    let settings = ModbusSettings::from_context(line, unit, context);
+    let link = match context.shared_link.filter(|link| *link.line() == settings.line) {
         Some(link) => link.clone(),
         None => Link::new(settings.line.clone(), settings.request_timeout, settings.quarantine)
             .map_err(|source| DriverError::Line { line: settings.line.to_string(), source })?,

@@ -477,16 +477,16 @@ impl<'a> Rewriter<'a> {
     /// # Errors
     /// A displacement above [`Amendment::max_shift_mm`].
     fn measure(&mut self, way: &dyn Fn(f64) -> Point, length: f64, shifts: &[Vector]) -> Result<(), Refusal> {
-        let largest_mm = shifts.iter().map(Vector::norm).fold(0.0, f64::max);
-        if largest_mm > self.amendment.max_shift_mm {
+        let max_mm = shifts.iter().map(Vector::norm).fold(0.0, f64::max);
+        if max_mm > self.amendment.max_shift_mm {
             let found = format!(
                 "the map would move the tool by {:.1} µm; the limit is {:.1} µm",
-                1e3 * largest_mm,
+                1e3 * max_mm,
                 1e3 * self.amendment.max_shift_mm
             );
             return Err((found, "check the map and its unit, or raise --max-correction-um"));
         }
-        self.done.max_shift_mm = self.done.max_shift_mm.max(largest_mm);
+        self.done.max_shift_mm = self.done.max_shift_mm.max(max_mm);
         let count = shifts.len() - 1;
         let beside = (0..count).filter(|&k| {
             let at = way((k as f64 + 0.5) / count as f64);

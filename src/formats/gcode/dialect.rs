@@ -73,7 +73,7 @@ pub struct Text {
     pub line_end: LineEnd,
     /// Maximum length of a line, in characters; longer comments are divided.
     #[schemars(range(min = 40, max = 10000))]
-    pub longest_line: usize,
+    pub max_line_length: usize,
     /// Text that begins a comment.
     #[schemars(length(min = 1, max = 8), extend("x-required" = true), example = &"(")]
     pub comment_begins: String,
@@ -87,7 +87,7 @@ pub struct Text {
 impl Default for Text {
     fn default() -> Self {
         let (comment_begins, comment_ends) = (String::new(), String::new());
-        Self { line_end: LineEnd::Lf, longest_line: 255, comment_begins, comment_ends, upper_case: false }
+        Self { line_end: LineEnd::Lf, max_line_length: 255, comment_begins, comment_ends, upper_case: false }
     }
 }
 
@@ -126,9 +126,9 @@ pub struct Numbers {
     pub decimals: u8,
     /// Whether a coordinate of 0 or more has a plus sign.
     pub plus: bool,
-    /// Largest coordinate.
+    /// Maximum coordinate.
     #[schemars(range(min = 1.0, max = 1e6))]
-    pub largest_mm: f64,
+    pub max_mm: f64,
     /// Number of decimals of an angle in degrees; all of them are written.
     #[schemars(range(min = 2, max = 6))]
     pub angle_decimals: u8,
@@ -141,7 +141,7 @@ pub struct Numbers {
 
 impl Default for Numbers {
     fn default() -> Self {
-        Self { decimals: 0, plus: false, largest_mm: 1e6, angle_decimals: 4, feed_decimals: 6, feed_point: false }
+        Self { decimals: 0, plus: false, max_mm: 1e6, angle_decimals: 4, feed_decimals: 6, feed_point: false }
     }
 }
 
@@ -313,7 +313,7 @@ pub struct Turning {
 pub struct Frame {
     /// Maximum length of the name of a program.
     #[schemars(range(min = 4, max = 80))]
-    pub longest_name: usize,
+    pub max_name_length: usize,
     /// First and last number of programs; each cycle uses the next number.
     pub numbers: Option<[u32; 2]>,
     /// Lines before the comments; `{name}` and `{number}` are those of the program.
@@ -330,7 +330,7 @@ pub struct Frame {
 
 impl Default for Frame {
     fn default() -> Self {
-        Self { longest_name: 24, numbers: None, begin: Vec::new(), setup: Vec::new(), end: Vec::new() }
+        Self { max_name_length: 24, numbers: None, begin: Vec::new(), setup: Vec::new(), end: Vec::new() }
     }
 }
 
@@ -385,11 +385,11 @@ pub enum DialectError {
     )]
     NoArcs { dialect: String },
     #[error(
-        "grinder.program.arcs_within_um is {found_um} µm, less than the {least_um:.4} µm by which the {decimals} \
+        "grinder.program.arcs_within_um is {found_um} µm, less than the {min_um:.4} µm by which the {decimals} \
          decimals of the dialect `{dialect}` move points; raise it, or write more decimals into a dialect of your \
          own if the control reads them"
     )]
-    ArcsFine { dialect: String, found_um: f64, decimals: u8, least_um: f64 },
+    ArcsFine { dialect: String, found_um: f64, decimals: u8, min_um: f64 },
     #[error(
         "grinder.program.arcs_within_um is {found_um} µm, more than grinding.chord_error_um, {limit_um} µm; write \
          {limit_um} or less"
@@ -493,15 +493,15 @@ impl Dialect {
     pub fn arcs(&self, within_mm: f64) -> Result<(&ArcWords, ArcOptions), DialectError> {
         let dialect = || self.dialect.name.clone();
         let words = self.arcs.as_ref().ok_or_else(|| DialectError::NoArcs { dialect: dialect() })?;
-        let (found_um, least_um, decimals) = (1e3 * within_mm, self.rounding_um(), self.numbers.decimals);
-        if found_um < least_um {
-            return Err(DialectError::ArcsFine { dialect: dialect(), found_um, decimals, least_um });
+        let (found_um, min_um, decimals) = (1e3 * within_mm, self.rounding_um(), self.numbers.decimals);
+        if found_um < min_um {
+            return Err(DialectError::ArcsFine { dialect: dialect(), found_um, decimals, min_um });
         }
         let options = ArcOptions {
             tolerance_mm: within_mm,
             steps_per_mm: 10f64.powi(i32::from(decimals)),
             max_radius_error_mm: 1e-3 * words.radius_error_um,
-            max_coordinate_mm: self.numbers.largest_mm,
+            max_coordinate_mm: self.numbers.max_mm,
             allows_helix: words.third_axis,
             // An arc must not need more blocks than the lines that it replaces.
             min_lines: if words.centre == CentreWords::BlockBefore { 3 } else { 2 },
@@ -570,14 +570,14 @@ impl Dialect {
     pub fn name(&self, part: &str, cycle: u16) -> String {
         let plain = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_uppercase() } else { '_' };
         let cycle = format!("_C{cycle}");
-        let room = self.program.longest_name.saturating_sub(cycle.len()).max(1);
+        let room = self.program.max_name_length.saturating_sub(cycle.len()).max(1);
         let begins_plainly = part.starts_with(|c: char| c.is_ascii_alphabetic());
         let part = if begins_plainly { part.to_owned() } else { format!("P{part}") };
         part.chars().map(plain).take(room).collect::<String>() + &cycle
     }
 
     /// Returns the faults of the dialect that the JSON schema of its file cannot detect. An example is a limit of the
-    /// line length (`text.longest_line`) that is too small for the block of a move. The list is empty if the dialect
+    /// line length (`text.max_line_length`) that is too small for the block of a move. The list is empty if the dialect
     /// has no such fault.
     pub fn faults(&self) -> Vec<DialectProblem> {
         let mut faults = Vec::new();
@@ -616,9 +616,9 @@ impl Dialect {
             }
         }
         let longest = self.longest_move();
-        if longest > self.text.longest_line {
-            let found = format!("is {}, and a move has up to {longest} characters", self.text.longest_line);
-            fault("text.longest_line", found, "a move is never divided", "raise it, or lower `numbers.largest_mm`");
+        if longest > self.text.max_line_length {
+            let found = format!("is {}, and a move has up to {longest} characters", self.text.max_line_length);
+            fault("text.max_line_length", found, "a move is never divided", "raise it, or lower `numbers.max_mm`");
         }
         for (key, line) in self.lines() {
             if let Some((found, allowed, remedy)) = self.fault_of(&key, line) {
@@ -684,9 +684,9 @@ impl Dialect {
                 "write each line as its own entry, in plain characters",
             ));
         }
-        if line.len() > self.text.longest_line {
+        if line.len() > self.text.max_line_length {
             let found = format!("has {} characters", line.len());
-            return Some((found, "it must be at most text.longest_line", "shorten it"));
+            return Some((found, "it must be at most text.max_line_length", "shorten it"));
         }
         let bare = match key.starts_with("path.blend.begin") {
             true => line.replace(TOLERANCE, ""),
@@ -716,7 +716,7 @@ impl Dialect {
     fn longest_move(&self) -> usize {
         let words = &self.words;
         let digits = |largest: f64| largest.log10().floor().max(0.0) as usize + 1;
-        let coordinate = digits(self.numbers.largest_mm) + 2 + usize::from(self.numbers.decimals);
+        let coordinate = digits(self.numbers.max_mm) + 2 + usize::from(self.numbers.decimals);
         let axes: usize = words.axes.iter().map(|axis| axis.len() + coordinate + words.between.len()).sum();
         let angle = if self.rotary == Tilting::default() {
             0
@@ -848,7 +848,7 @@ pub(super) mod tests {
         assert_eq!(keys(&|d| d.program.numbers = Some([8, 7])), ["program.numbers"]);
         assert_eq!(keys(&|d| d.words.rapid = d.words.line.clone()), ["words.rapid"]);
         assert_eq!(keys(&|d| d.words.axes[1] = "X".into()), ["words.axes"]);
-        assert_eq!(keys(&|d| d.text.longest_line = 40), ["text.longest_line"]);
+        assert_eq!(keys(&|d| d.text.max_line_length = 40), ["text.max_line_length"]);
         assert_eq!(keys(&|d| d.dialect.extension = ".nc".into()), ["dialect.extension"]);
         assert_eq!(keys(&|d| d.path.blend.as_mut().unwrap().begin.push("G5\n".into())), ["path.blend.begin[1]"]);
         let slides = |d: &mut Dialect, line: &str| d.rotary.slides.as_mut().unwrap().begin.push(line.into());

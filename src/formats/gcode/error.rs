@@ -21,10 +21,10 @@ pub enum GcodeError {
     #[error(transparent)]
     Dialect(#[from] DialectError),
     #[error(
-        "{axis} of move {number} is {value_mm} mm; the dialect allows at most {largest_mm} mm (numbers.largest_mm); \
+        "{axis} of move {number} is {value_mm} mm; the dialect allows at most {max_mm} mm (numbers.max_mm); \
          move the work offset"
     )]
-    Large { axis: char, value_mm: f64, number: u64, largest_mm: f64 },
+    Large { axis: char, value_mm: f64, number: u64, max_mm: f64 },
     #[error(
         "the feed of {feed_mm_min} mm/min of move {number} is 0 with {decimals} decimals (numbers.feed_decimals); \
          raise grinding.feed_mm_min"
@@ -45,8 +45,8 @@ impl GcodeError {
     pub(super) fn after(self, moves: u64) -> Self {
         match self {
             Self::NotFinite { axis, value_mm, number } => Self::NotFinite { axis, value_mm, number: number + moves },
-            Self::Large { axis, value_mm, number, largest_mm } => {
-                Self::Large { axis, value_mm, number: number + moves, largest_mm }
+            Self::Large { axis, value_mm, number, max_mm } => {
+                Self::Large { axis, value_mm, number: number + moves, max_mm }
             }
             Self::Slow { feed_mm_min, decimals, number } => {
                 Self::Slow { feed_mm_min, decimals, number: number + moves }

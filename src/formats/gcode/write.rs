@@ -423,11 +423,11 @@ impl<'a> Lines<'a> {
     /// A value that is not finite or exceeds the limit of the dialect.
     #[inline]
     fn rounded(&self, axis: usize, value_mm: f64) -> Result<i64, GcodeError> {
-        let largest_mm = self.dialect.numbers.largest_mm;
-        if value_mm.is_nan() || value_mm.abs() > largest_mm {
+        let max_mm = self.dialect.numbers.max_mm;
+        if value_mm.is_nan() || value_mm.abs() > max_mm {
             let axis = ['X', 'Y', 'Z'][axis];
             return Err(match value_mm.is_finite() {
-                true => GcodeError::Large { axis, value_mm, number: self.count, largest_mm },
+                true => GcodeError::Large { axis, value_mm, number: self.count, max_mm },
                 false => GcodeError::NotFinite { axis, value_mm, number: self.count },
             });
         }
@@ -591,7 +591,7 @@ impl<'a> Frame<'a> {
         let text = &self.dialect.text;
         // A block number before the comment takes space too.
         let marks = text.comment_begins.len() + text.comment_ends.len() + 12;
-        let room = text.longest_line.saturating_sub(marks).max(20);
+        let room = text.max_line_length.saturating_sub(marks).max(20);
         let words = comment(words);
         let words = if text.upper_case { words.to_ascii_uppercase() } else { words };
         let mut lines = vec![String::new()];
@@ -913,7 +913,7 @@ mod tests {
         for name in ["linuxcnc", "fanuc", "sinumerik", "heidenhain"] {
             let dialect = shipped(name);
             let text = write_in(&dialect, &tracks(3), 6).unwrap();
-            assert!(text.is_ascii() && text.lines().all(|line| line.len() <= dialect.text.longest_line), "{name}");
+            assert!(text.is_ascii() && text.lines().all(|line| line.len() <= dialect.text.max_line_length), "{name}");
             let counted = format!("LINES: {}", text.lines().count());
             assert!(text.to_ascii_uppercase().contains(&counted), "{name}: {text}");
             assert!(!dialect.text.upper_case || text == text.to_ascii_uppercase(), "{name}");

@@ -28,8 +28,8 @@ use crate::settings::OpcUaSettings;
 const BETWEEN_TRIES: Duration = Duration::from_secs(1);
 /// Time that clients have to disconnect when the server stops.
 const FAREWELL: Duration = Duration::from_secs(2);
-/// Default timeout of a client's publish request, in ms. A cell can be unchanged for longer than a client may be silent,
-/// so the timeout is long.
+/// Default timeout of a client's publish request, in ms. A cell can be unchanged for longer than a client may be
+/// silent, so the timeout is long.
 const WAITS_MS: u64 = 3_600_000;
 /// Interval, in ms, at which the server checks whether a publish to a client is due. An interval that ends between two
 /// checks is served at the second. If the checks were as far apart as the shortest publishing interval, a keep-alive
@@ -87,8 +87,8 @@ impl UaServer {
             () = show(&mut self.status, &handle, &shown) => None,
         };
         if let Some(ended) = ended {
-            let why = ended.unwrap_or_else(|error| Err(error.to_string()));
-            return why.map_err(server);
+            let reason = ended.unwrap_or_else(|error| Err(error.to_string()));
+            return reason.map_err(server);
         }
         handle.cancel();
         // Clients that do not disconnect in time are dropped.

@@ -76,7 +76,7 @@ enum SessionEnd {
     /// The source of the state has closed.
     Ended,
     /// The broker is gone or was never reached; `stood` is true if the connection was established before.
-    Lost { why: String, stood: bool },
+    Lost { reason: String, stood: bool },
 }
 
 impl Node {
@@ -118,8 +118,8 @@ impl Node {
         let mut connection = self.bd_seq.next()?;
         loop {
             let began = Instant::now();
-            let SessionEnd::Lost { why, stood } = self.session(connection).await else { return Ok(()) };
-            self.notes.retrying(&self.broker.place, why);
+            let SessionEnd::Lost { reason, stood } = self.session(connection).await else { return Ok(()) };
+            self.notes.retrying(&self.broker.place, reason);
             if stood {
                 connection = self.bd_seq.next()?;
             }
@@ -212,7 +212,7 @@ impl Session<'_> {
     fn handle_event(&mut self, event: Option<Result<Event, ConnectionError>>) -> Result<(), SessionEnd> {
         self.stood |= matches!(event, Some(Ok(Event::Incoming(Packet::ConnAck(_)))));
         let stood = self.stood;
-        let lost = |why: String| Err(SessionEnd::Lost { why, stood });
+        let lost = |reason: String| Err(SessionEnd::Lost { reason, stood });
         match event {
             None => lost("the connection was closed".into()),
             Some(Err(error)) => lost(in_words(&error)),
@@ -225,9 +225,10 @@ impl Session<'_> {
             Some(Ok(Event::Incoming(Packet::SubAck(ack)))) => {
                 let refused = ack.return_codes.contains(&SubscribeReasonCode::Failure);
                 if refused {
-                    let why = "no host can request a birth: the broker does not let the node subscribe to its commands"
-                        .to_owned();
-                    self.node.notes.retrying(&self.node.broker.place, why);
+                    let reason =
+                        "no host can request a birth: the broker does not let the node subscribe to its commands"
+                            .to_owned();
+                    self.node.notes.retrying(&self.node.broker.place, reason);
                 } else {
                     self.node.notes.connected(&self.node.broker.place);
                 }

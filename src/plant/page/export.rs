@@ -69,7 +69,7 @@ pub(super) async fn csv(
 ) -> Response {
     match within(csv_of(&plant, &asked)).await {
         Ok(text) => file("parts.csv", "text/csv; charset=utf-8", text),
-        Err(why) => unmade(&session, &why),
+        Err(reason) => unmade(&session, &reason),
     }
 }
 
@@ -118,7 +118,7 @@ pub(super) async fn dfq(
 ) -> Response {
     match within(dfq_of(&plant, &asked)).await {
         Ok(text) => file("parts.dfq", "text/plain; charset=utf-8", text),
-        Err(why) => unmade(&session, &why),
+        Err(reason) => unmade(&session, &reason),
     }
 }
 

@@ -203,7 +203,7 @@ fn drawn(map: &Map, limit_um: f64) -> Markup {
             svg.replace(" style=\"image-rendering:pixelated\"", " image-rendering=\"pixelated\"")
                 .replace(" style=\"image-rendering:auto\"", ""),
         ),
-        Err(why) => html! { p .no { "No map: " (shown(&why)) } },
+        Err(reason) => html! { p .no { "No map: " (shown(&reason)) } },
     }
 }
 

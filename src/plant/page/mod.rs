@@ -126,7 +126,7 @@ impl From<PlantError> for PageError {
 async fn page(session: &Session, making: impl Future<Output = Result<PageContent, PageError>>) -> Response {
     match within(making).await {
         Ok(PageContent { title, again_s, main }) => plant_document(&title, session, again_s, STYLE, main),
-        Err(why) => unmade(session, &why),
+        Err(reason) => unmade(session, &reason),
     }
 }
 
@@ -140,11 +140,11 @@ async fn within<T>(making: impl Future<Output = Result<T, PageError>>) -> Result
     tokio::time::timeout(PATIENCE, making).await.unwrap_or_else(|_| Err(late()))
 }
 
-/// Returns an error page. `why` is the reason why the requested page cannot be shown. The page contains the reason, and
-/// the reason determines the HTTP status. If the plant cannot be reached, the browser requests the page again every 5
-/// s. `session` is the session of the person who has signed in.
-fn unmade(session: &Session, why: &PageError) -> Response {
-    let (status, again_s, title, words) = match why {
+/// Returns an error page. `reason` is the reason why the requested page cannot be shown. The page contains the reason,
+/// and the reason determines the HTTP status. If the plant cannot be reached, the browser requests the page again every
+/// 5 s. `session` is the session of the person who has signed in.
+fn unmade(session: &Session, reason: &PageError) -> Response {
+    let (status, again_s, title, words) = match reason {
         PageError::Plant(error) if error.may_pass() => (
             StatusCode::SERVICE_UNAVAILABLE,
             Some(AGAIN_S),

@@ -132,10 +132,10 @@ async fn prove(plant: &PlantPage, cell: &str, name: &str) -> Result<Proof, Plant
 }
 
 impl Proof {
-    fn failed(run: &PlantRun, why: &str) -> Self {
-        let why = why.to_owned();
-        let none = || Err(why.clone());
-        Self { at: now(), outcome: Err(why.clone()), keys: run.keys.len(), report: none(), qif: none(), dfq: none() }
+    fn failed(run: &PlantRun, reason: &str) -> Self {
+        let reason = reason.to_owned();
+        let none = || Err(reason.clone());
+        Self { at: now(), outcome: Err(reason.clone()), keys: run.keys.len(), report: none(), qif: none(), dfq: none() }
     }
 }
 

@@ -83,7 +83,7 @@ pub(super) async fn by_name(
     };
     match super::within(found).await {
         Ok(id) => Redirect::to(&format!("/runs/{id}")).into_response(),
-        Err(why) => unmade(&session, &why),
+        Err(reason) => unmade(&session, &reason),
     }
 }
 
@@ -168,8 +168,8 @@ fn proof_text(proof: Option<&Proof>) -> Markup {
                     @if found.closed { "." } @else { ". The run has no recorded end: it is still active, or its record was cut before the end arrived." }
                 }
             }
-            Err(why) => {
-                p .no role="alert" { strong { "NOT PROVEN" } " at " (proof.at) " UTC: " (shown(why)) }
+            Err(reason) => {
+                p .no role="alert" { strong { "NOT PROVEN" } " at " (proof.at) " UTC: " (shown(reason)) }
                 p { "Keep the plant and the cell as they are, and compare: regrind audit verify --plant" }
             }
         }
@@ -182,7 +182,7 @@ fn made_of_it(run: &Run, proof: &Proof) -> Markup {
         html! {
             @match made {
                 Ok(_) => { li { a href=(format!("/runs/{id}/{path}")) { (name) } } }
-                Err(why) => { li .quiet { (name) ": " (shown(why)) } }
+                Err(reason) => { li .quiet { (name) ": " (shown(reason)) } }
             }
         }
     };
@@ -257,9 +257,9 @@ pub(super) async fn report(
                 ];
                 (headers, html.clone()).into_response()
             }
-            Err(why) => not_made(&session, why),
+            Err(reason) => not_made(&session, reason),
         },
-        Err(why) => unmade(&session, &why),
+        Err(reason) => unmade(&session, &reason),
     }
 }
 
@@ -290,9 +290,9 @@ async fn results(
     match proof_of(plant, id).await {
         Ok((run, proof)) => match of(&proof) {
             Ok(text) => file(&format!("run-{}.{ending}", run.id), kind, text.clone()),
-            Err(why) => not_made(session, why),
+            Err(reason) => not_made(session, reason),
         },
-        Err(why) => unmade(session, &why),
+        Err(reason) => unmade(session, &reason),
     }
 }
 
@@ -304,9 +304,9 @@ pub(super) fn file(name: &str, kind: &'static str, content: String) -> Response 
 }
 
 /// Returns an error page with HTTP status 422 for a document that cannot be created from the plant's copy of a run.
-/// `why` is the reason that the page shows. `session` is the session of the person who has signed in.
-fn not_made(session: &Session, why: &str) -> Response {
-    let mut response = unmade(session, &PageError::NotHere(why.to_owned()));
+/// `reason` is the reason that the page shows. `session` is the session of the person who has signed in.
+fn not_made(session: &Session, reason: &str) -> Response {
+    let mut response = unmade(session, &PageError::NotHere(reason.to_owned()));
     *response.status_mut() = StatusCode::UNPROCESSABLE_ENTITY;
     response
 }

@@ -110,10 +110,10 @@ pub struct ParameterCorrections {
     /// millimetres.
     #[serde(rename = "displaced_mm")]
     pub displacement_mm: Vec<f64>,
-    /// Part of `displaced_mm` that setting and tilt cause. A grinder has an input for its wheel radius, but can apply
-    /// setting and tilt only through its map.
+    /// Part of `displacement_mm` that setting and tilt cause. A grinder has an input for its wheel radius, but can
+    /// apply setting and tilt only through its map.
     pub setting_mm: Vec<f64>,
-    /// Part of `displaced_mm` that remains after registration: a map without these corrections would have to contain
+    /// Part of `displacement_mm` that remains after registration: a map without these corrections would have to contain
     /// it.
     #[serde(rename = "seen_mm")]
     pub apparent_mm: Vec<f64>,

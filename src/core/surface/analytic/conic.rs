@@ -1,8 +1,8 @@
 //! Surfaces of revolution: plane, sphere, conic, and the asphere of ISO 10110-12.
 //!
-//! Sign conventions of ISO 10110-12: z runs along the optical axis from the vertex; a radius is positive when the centre of
-//! curvature lies at +z. With h^2 = x^2 + y^2 and c = 1/R
-//! `z = c h^2 / (1 + sqrt(1 - (1 + k) c^2 h^2)) + sum A_i h^i`.
+//! Sign conventions of ISO 10110-12: z runs along the optical axis from the vertex; a radius is positive when the
+//! centre of curvature lies at +z. With h^2 = x^2 + y^2 and c = 1/R `z = c h^2 / (1 + sqrt(1 - (1 + k) c^2 h^2)) + sum
+//! A_i h^i`.
 
 use std::collections::BTreeMap;
 

@@ -1,7 +1,8 @@
 //! Forbes' aspheres: Qcon for strong and Qbfs for mild aspheres.
 //!
 //! G. W. Forbes, Shape specification for axially symmetric optical surfaces, Opt. Express 15, 5218 (2007), and Robust,
-//! efficient computational methods for axially symmetric optical aspheres, Opt. Express 18, 19700 (2010). With u = h / Rn
+//! efficient computational methods for axially symmetric optical aspheres, Opt. Express 18, 19700 (2010). With u = h /
+//! Rn
 //!
 //! - Qcon: `z = conic + u^4 sum a_m Qcon_m(u^2)`, with Qcon_m(x) = P_m^(0, 4)(2x - 1);
 //! - Qbfs: `z = sphere + u^2 (1 - u^2) / sqrt(1 - c^2 h^2) sum a_m Qbfs_m(u^2)`, the polynomials chosen so that the slope of the
@@ -233,7 +234,8 @@ mod tests {
 
     #[test]
     fn qbfs_slopes_are_orthonormal() {
-        // With u = sin(t) the weight 1 / sqrt(1 - u^2) is that of equidistant t; the integrand is a polynomial in cos(2t).
+        // With u = sin(t) the weight 1 / sqrt(1 - u^2) is that of equidistant t; the integrand is a polynomial in
+        // cos(2t).
         let count = 200;
         for m in 0..20 {
             for n in 0..=m {

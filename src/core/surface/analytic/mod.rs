@@ -1,8 +1,8 @@
 //! Surfaces given by a formula: their sag and exact gradient, their definition in TOML, and their sampling.
 //!
 //! **The conventions, said once.** A surface is z = f(x, y) in its own frame, lengths in millimetres; z runs along the optical
-//! axis, and a radius of curvature is positive when its centre lies at +z (ISO 10110-12). The unit normal is the one on the
-//! +z side. Gradients come from closed forms or from the derivatives of the recurrences, never from differences.
+//! axis, and a radius of curvature is positive when its centre lies at +z (ISO 10110-12). The unit normal is the one on
+//! the +z side. Gradients come from closed forms or from the derivatives of the recurrences, never from differences.
 //!
 //! ```text
 //!  text --from_toml--> SurfaceDefinition --resolve--> DefinedSurface --sample--> SampledSurface

@@ -166,8 +166,8 @@ mod tests {
 
     #[test]
     fn toroid_by_hand() {
-        // At y = 3 the curve of radius 5 has risen by 1, so 13 - 1 = 12 is left to the line at 13; at x = 7.2 the circle of
-        // radius 12 (3-4-5) stands 9.6 below the line.
+        // At y = 3 the curve of radius 5 has risen by 1, so 13 - 1 = 12 is left to the line at 13; at x = 7.2 the
+        // circle of radius 12 (3-4-5) stands 9.6 below the line.
         let (z, [gx, gy]) = toroid(13.0, 5.0).sag_and_gradient(7.2, 3.0).unwrap();
         assert!((z - 3.4).abs() < 1e-14 && (gx - 0.75).abs() < 1e-14);
         assert!((gy - 12.0 / 9.6 * 0.75).abs() < 1e-14);

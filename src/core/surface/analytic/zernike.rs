@@ -1,12 +1,13 @@
 //! Zernike polynomials, in the three usual numberings.
 //!
 //! With rho = h / Rn and the azimuth theta counted from x towards y, a term of degree n and azimuthal order m is
-//! R_n^|m|(rho) cos(m theta) for m >= 0 and R_n^|m|(rho) sin(|m| theta) for m < 0, where R_n^m(1) = 1. Noll's (1976) and the
-//! ANSI Z80.28 terms carry the factor sqrt(n + 1), times sqrt(2) unless m is 0, which makes their mean square over the disc 1;
-//! the Fringe terms carry none.
+//! R_n^|m|(rho) cos(m theta) for m >= 0 and R_n^|m|(rho) sin(|m| theta) for m < 0, where R_n^m(1) = 1. Noll's (1976)
+//! and the ANSI Z80.28 terms carry the factor sqrt(n + 1), times sqrt(2) unless m is 0, which makes their mean square
+//! over the disc 1; the Fringe terms carry none.
 //!
-//! R_n^m(rho) = rho^m P_k^(0, m)(2 rho^2 - 1) with k = (n - m) / 2, and rho^m cos(m theta), rho^m sin(m theta) are the real
-//! and imaginary part of (u + i v)^m: everything is a polynomial in u = x / Rn, v = y / Rn, without a special case on the axis.
+//! R_n^m(rho) = rho^m P_k^(0, m)(2 rho^2 - 1) with k = (n - m) / 2, and rho^m cos(m theta), rho^m sin(m theta) are the
+//! real and imaginary part of (u + i v)^m: everything is a polynomial in u = x / Rn, v = y / Rn, without a special case
+//! on the axis.
 
 use std::collections::BTreeMap;
 
@@ -282,7 +283,8 @@ mod tests {
 
     #[test]
     fn noll_and_ansi_are_orthonormal() {
-        // Exact quadrature for degree 16: equidistant azimuths and Gauss-Legendre nodes in rho^2, here by Newton's method.
+        // Exact quadrature for degree 16: equidistant azimuths and Gauss-Legendre nodes in rho^2, here by Newton's
+        // method.
         let nodes: Vec<(f64, f64)> = (1..=12)
             .map(|i| {
                 let last: Vec<[f64; 1]> = (0..=12).map(|k| [f64::from(k == 12)]).collect();

@@ -153,7 +153,8 @@ fn form_height_matches_deviations() {
         let used = found.deviations.iter().filter(|d| d.status == PointStatus::Inlier);
         for (of, d) in form.points.iter().zip(used) {
             assert!((of.place_mm[0] - d.point.x).abs() < 1e-12 && (of.place_mm[1] - d.point.y).abs() < 1e-12, "{name}");
-            // The form is after its own best fit, which the defect tilts, and the deviations are after one that it does not.
+            // The form is after its own best fit, which the defect tilts, and the deviations are after one that it does
+            // not.
             let off_mm = (of.form.mean_mm - d.deviation_mm).abs();
             assert!(off_mm < 6.0 * NOISE_MM + 0.1 * found.quality.pv_mm, "{name}: {of:?} of {d:?}");
         }

@@ -6,7 +6,8 @@ use regrind_core::surface::{DistanceModel, FacetIndex, Nominal, OffsetSurface, S
 use regrind_sim::form::FormError;
 use regrind_sim::shape::{FreeForm, Shape};
 
-/// Largest and least error of the distance over points whose exact distance is known, inside and within two steps of the edge.
+/// Largest and least error of the distance over points whose exact distance is known, inside and within two steps of
+/// the edge.
 fn errors_nm(nominal: &Nominal, distance: DistanceModel, step: [f64; 2]) -> [f64; 2] {
     let shape = FreeForm::default();
     let form = FormError::new(3, 30.0, 6.657e-3, 102.0, 62.0);

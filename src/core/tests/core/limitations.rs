@@ -141,7 +141,8 @@ fn gap_of_nominal_is_reported() {
 fn projection_stays_on_gutter_wall() {
     const GUTTER_MM: f64 = 4.0;
     const BALL_MM: f64 = 2.0;
-    // A cylinder about y that is open upwards, to a slope of 72 degrees; a little narrower at one end, which holds it along y.
+    // A cylinder about y that is open upwards, to a slope of 72 degrees; a little narrower at one end, which holds it
+    // along y.
     let radius = |y: f64| GUTTER_MM + 0.01 * y;
     let height = |x: f64, y: f64| -(radius(y).powi(2) - x * x).sqrt();
     for as_grid in [true, false] {
@@ -351,8 +352,8 @@ fn no_verdict_when_points_contradict() {
             }
         }
         let found = register(&nominal, &measured, &RegistrationOptions::new(RADIUS_MM)).unwrap();
-        let why = found.unjudgeable_reason();
-        assert_eq!(why.is_none(), is_judged, "{share}: {why:?}");
+        let reason = found.unjudgeable_reason();
+        assert_eq!(reason.is_none(), is_judged, "{share}: {reason:?}");
         assert_eq!(has_warning(&found, "contradict their neighbours"), !is_judged);
     }
 }

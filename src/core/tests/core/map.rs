@@ -309,7 +309,8 @@ fn two_agreeing_neighbours_are_inliers() {
 
 #[test]
 fn repeats_do_not_confirm_outlier() {
-    // Targets 260 mm apart that are touched three times each, a few tenths of a millimetre beside; one is not where it should be.
+    // Targets 260 mm apart that are touched three times each, a few tenths of a millimetre beside; one is not where it
+    // should be.
     let wave = |x: f64, y: f64| 0.1 * (x / 900.0).sin() * (y / 700.0).cos();
     let beside = [[0.0, 0.0], [0.3, -0.2], [-0.1, 0.4]];
     let touched = sampled(22, 24, [260.0, 260.0], wave);
@@ -418,7 +419,8 @@ fn map_levels_off_outside_points() {
     let map = fitted_map(&readings, &MapOptions { level_off_mm, ..MapOptions::new(6.0, 1.0) });
     let corner = map.grid.len() - 1;
     assert!(!map.valid[corner] && map.valid[map.grid.len() / 2]);
-    // From the nearest valid node, off by 4/27 of slope times distance at most, and without slope at the corner, 16 mm away.
+    // From the nearest valid node, off by 4/27 of slope times distance at most, and without slope at the corner, 16 mm
+    // away.
     let most = map.samples_mm().into_iter().map(|[_, _, e]| e).fold(0.0, f64::max);
     assert!(map.values_mm.iter().all(|v| v.abs() <= most + 4.0 / 27.0 * 1e-4 * level_off_mm + 1e-12));
     let [x, y] = map.grid.place_mm(corner);

@@ -108,7 +108,8 @@ fn wheel_radius_on_bowl_is_compensated() {
     let set = ParameterCorrections::from_values(values, 2, [&[steep], &[steep]], &options).unwrap();
     assert!((set.displacement_mm[0] - 0.1 * (2.0 / 3f64.sqrt() - 1.0)).abs() < 1e-15 && set.setting_mm[0] == 0.0);
     assert_eq!(ParameterCorrections::from_values([0.0; ParameterKind::COUNT], 2, [&[steep], &[steep]], &options), None);
-    // On a free form it is told beside a form of 0.3 um, and all but its uncertainty is taken, 0.1 (1 + s^2 / 0.1^2)^-1.
+    // On a free form it is told beside a form of 0.3 um, and all but its uncertainty is taken, 0.1 (1 + s^2 /
+    // 0.1^2)^-1.
     let form = FormError::with_rms(&mut regrind_sim::rng(3), 14.0, 3e-4);
     let contacts =
         contacts_on(&FreeForm::default(), |c, _| planted(c, 0.1, 0.0, 0.0) + form.height(c.point.x, c.point.y));

@@ -175,7 +175,8 @@ fn part_priors_preserve_coverage() {
 #[test]
 #[ignore = "worlds are drawn, for .ci/long"]
 fn unlike_part_overrides_priors() {
-    // Twenty parts have taught that a form is narrow and next to the scatter; this one is wide and strong, and the other way round.
+    // Twenty parts have taught that a form is narrow and next to the scatter; this one is wide and strong, and the
+    // other way round.
     let many = |range_mm: f64, ratio: f64| {
         (0..20).fold(None, |lesson, _| Some(PartFit::updated(lesson, &hyperparameters(range_mm, ratio))))
     };

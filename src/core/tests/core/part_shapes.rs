@@ -174,7 +174,8 @@ fn polar_cap(radius: f64, count: usize, polar_deg: f64, phase: f64) -> Vec<Point
 
 /// A bumpy hyperparameters-hemisphere: radius and normal in closed form over the direction.
 fn bumpy(direction: &Vector) -> (Point, Vector) {
-    // The level set F(p) = |p| - r(p/|p|), r = 20 + 0.8 (u.x^2 - 0.7 u.y u.z + 0.5 u.x u.z + 0.4 u.y), u on the unit sphere.
+    // The level set F(p) = |p| - r(p/|p|), r = 20 + 0.8 (u.x^2 - 0.7 u.y u.z + 0.5 u.x u.z + 0.4 u.y), u on the unit
+    // sphere.
     let u = direction.normalize();
     let radius = |u: &Vector| 20.0 + 0.8 * (u.x * u.x - 0.7 * u.y * u.z + 0.5 * u.x * u.z + 0.4 * u.y);
     let gradient = Vector::new(2.0 * u.x + 0.5 * u.z, -0.7 * u.z + 0.4, -0.7 * u.y + 0.5 * u.x) * 0.8;
@@ -240,7 +241,8 @@ fn folding_offset_refused_with_radius() {
         register(&nominal, &cloud, &options),
         Err(RegistrationError::Surface(SurfaceError::OffsetFolds { .. }))
     ));
-    // A gutter of which a probe of 1.45 mm touches both walls at once: measured with a smaller one, registered with that one.
+    // A gutter of which a probe of 1.45 mm touches both walls at once: measured with a smaller one, registered with
+    // that one.
     for wide in [[4.0, 20.0], [2.9, 30.0]] {
         let gutter = Biconic { radius_mm: [1.4, 90.0], conic: [-1.0, -1.0] };
         let nominal = gridded(&gutter, wide, [81, 81]);

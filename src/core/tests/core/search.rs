@@ -6,7 +6,8 @@ use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
 use regrind_sim::shape::FreeForm;
 
-/// Registers random poses of a patch without a start and returns the seeds, with their errors, that missed by more than a limit.
+/// Registers random poses of a patch without a start and returns the seeds, with their errors, that missed by more than
+/// a limit.
 fn missed_poses(
     corners: [[f64; 2]; 2],
     counts: [usize; 2],

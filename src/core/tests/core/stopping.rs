@@ -131,14 +131,15 @@ fn form_between_points_covers_truth() {
     println!(
         "of {parts} parts with {touches} touches RMS held in {rms}, PV in {pv}; intervals are {width:.2?} of them wide"
     );
-    let most_missed = 1 + parts as u32 / 7;
-    assert!(rms + most_missed >= parts as u32 && pv + most_missed >= parts as u32, "{rms} {pv}");
+    let max_missed = 1 + parts as u32 / 7;
+    assert!(rms + max_missed >= parts as u32 && pv + max_missed >= parts as u32, "{rms} {pv}");
     assert!(width[0] < 0.5 && width[1] < 0.6, "{width:?}");
 }
 
 #[test]
 fn figures_include_fine_ridges() {
-    // Ridges of 0.5 um that no touch can tell from the scatter of a probe, and a probe that scatters by as much by itself.
+    // Ridges of 0.5 um that no touch can tell from the scatter of a probe, and a probe that scatters by as much by
+    // itself.
     let rough = Part::new(3, 1e-9, |x, y| 5e-4 * (f64::sin(9.1 * x) * f64::cos(7.7 * y)).signum());
     let (first, last) = two_far_batches(&rough, 120);
     let told = rough.form(&[first.clone(), last.clone()].concat()).figures;
@@ -209,13 +210,13 @@ fn stopping_risk_of_repeated_tests() {
 fn stopping_prefers_pass_after_a_sixth() {
     let part = Part::smooth(5, 5e-3);
     let never = StoppingCriteria { correction_sigma_mm: 1e-7, ..STRICT };
-    let why = |count, purpose: &StoppingCriteria| {
+    let reason = |count, purpose: &StoppingCriteria| {
         let (first, last) = two_far_batches(&part, count);
         part.decide(&first, &last, purpose).reason
     };
-    assert_eq!(why(part.targets.len() / 6 - 2, &never), Reason::FormUnknown);
-    assert_eq!(why(part.targets.len() / 6, &never), Reason::CorrectionPreferred);
-    assert_eq!(why(part.targets.len() / 6, &StoppingCriteria { may_grind: false, ..never }), Reason::BeyondLimit);
+    assert_eq!(reason(part.targets.len() / 6 - 2, &never), Reason::FormUnknown);
+    assert_eq!(reason(part.targets.len() / 6, &never), Reason::CorrectionPreferred);
+    assert_eq!(reason(part.targets.len() / 6, &StoppingCriteria { may_grind: false, ..never }), Reason::BeyondLimit);
 }
 
 #[test]
@@ -288,7 +289,8 @@ fn chip_at_edge_is_not_dust() {
     let again = part.decide(&[&first[..], &last].concat(), &seen.next, &LOOSE);
     let told = again.form.figures.pv;
     println!("{:?}: {told:?}", again.reason);
-    // Touches that agree with each other are form, however deep; those that do not are a feature of which nobody knows the edge.
+    // Touches that agree with each other are form, however deep; those that do not are a feature of which nobody knows
+    // the edge.
     assert!(
         again.reason == Reason::NarrowFeature && again.next.len() + 80 + seen.next.len() == part.targets.len()
             || told.low_mm > 0.03

@@ -90,6 +90,6 @@ impl LinuxcncGrinder {
     }
 }
 
-pub(super) fn unknown(why: &str) -> Reconciled {
-    Reconciled::Unknown { reason: why.to_owned() }
+pub(super) fn unknown(reason: &str) -> Reconciled {
+    Reconciled::Unknown { reason: reason.to_owned() }
 }

@@ -71,8 +71,8 @@ impl LinuxcncGrinder {
         }
     }
 
-    fn unready(&self, why: &'static str) -> DeviceError {
-        DeviceError::NotReady { machine: self.machine(), reason: why }
+    fn unready(&self, reason: &'static str) -> DeviceError {
+        DeviceError::NotReady { machine: self.machine(), reason }
     }
 
     /// Makes the controller write `token`, the random number of this preparation, into the log file of `program`; the
@@ -98,11 +98,11 @@ impl LinuxcncGrinder {
             if began.elapsed() > self.settings.settle_timeout {
                 let (here, there) = (self.folders.local.display(), &self.folders.remote);
                 let errors = self.controller.errors().await?.join("; ");
-                let why = format!(
+                let reason = format!(
                     "the log file {record}, which the controller writes, does not appear in {here}: check that {there} on \
                      the computer of the controller is this folder, and that the account of LinuxCNC has the right to write there. {errors}"
                 );
-                return Err(DeviceError::Folder { machine: self.machine(), reason: why });
+                return Err(DeviceError::Folder { machine: self.machine(), reason });
             }
             sleep(POLL_INTERVAL).await;
         }

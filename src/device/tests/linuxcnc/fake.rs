@@ -1,4 +1,5 @@
-//! A linuxcncrsh that stands in this process, does what a controller does with lines and programs, and goes wrong where it is told to.
+//! A linuxcncrsh that stands in this process, does what a controller does with lines and programs, and goes wrong where
+//! it is told to.
 
 use std::collections::VecDeque;
 use std::fs::{self, OpenOptions};

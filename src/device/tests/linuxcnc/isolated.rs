@@ -1,5 +1,5 @@
-//! A controller of its own for each test: the test runs itself again in namespaces of its own, where ports, shared memory, locks and
-//! processes are nobody else's and end with it.
+//! A controller of its own for each test: the test runs itself again in namespaces of its own, where ports, shared
+//! memory, locks and processes are nobody else's and end with it.
 
 use std::fs;
 use std::future::Future;
@@ -79,7 +79,8 @@ impl Controller {
         }
     }
 
-    /// Has the place of every joint written into a file at every servo cycle: x, y, z in millimetres behind the number of the sample.
+    /// Has the place of every joint written into a file at every servo cycle: x, y, z in millimetres behind the number
+    /// of the sample.
     pub fn sample(&self) -> (Child, PathBuf) {
         let file = self.folder.join("path.txt");
         (as_account("halsampler").arg("-t").arg(&file).spawn().unwrap(), file)

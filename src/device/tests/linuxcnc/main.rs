@@ -1,4 +1,5 @@
-//! A grinder by LinuxCNC: against a server in this process that does what it is told to, and against the controller itself.
+//! A grinder by LinuxCNC: against a server in this process that does what it is told to, and against the controller
+//! itself.
 
 mod bench;
 mod fake;

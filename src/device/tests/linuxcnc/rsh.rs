@@ -225,7 +225,8 @@ async fn abort_sent_during_pending_reply() {
         started = grinder.start(armed) => panic!("{started:?}"),
         () = fake.has_heard("set run") => {}
     }
-    // The server reads on when it has answered, so what was sent meanwhile is heard then: behind the run and before anything else.
+    // The server reads on when it has answered, so what was sent meanwhile is heard then: behind the run and before
+    // anything else.
     let heard = fake.clone();
     let (aborted, ()) = tokio::join!(grinder.abort(), async move {
         tokio::task::yield_now().await;
@@ -368,7 +369,7 @@ async fn run_pass(bench: &Bench, fake: &FakeServer) -> Outcome {
             if let Some(armed) = armed.as_ref().filter(|_| is_started) {
                 match grinder.reconcile(armed).await? {
                     Reconciled::NotStarted(_) => is_started = false,
-                    Reconciled::Unknown { reason: why } => panic!("{why}"),
+                    Reconciled::Unknown { reason } => panic!("{reason}"),
                     _ => {}
                 }
             }

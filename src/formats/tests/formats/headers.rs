@@ -1,5 +1,5 @@
-//! Headers that are drawn: names, orders, groups, languages, units, comments. Who draws one knows which numbers were measured and in which unit;
-//! a table is read so, or it is refused.
+//! Headers that are drawn: names, orders, groups, languages, units, comments. Who draws one knows which numbers were
+//! measured and in which unit; a table is read so, or it is refused.
 
 use std::path::Path;
 

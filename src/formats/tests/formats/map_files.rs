@@ -1,7 +1,7 @@
 //! Maps of interferometers and profilometers as they are found, and what is wrong with them.
 //!
-//! Real files stand outside of the project, in the folder that REGRIND_DATA names; without it the tests that need them say so and
-//! leave themselves out.
+//! Real files stand outside of the project, in the folder that REGRIND_DATA names; without it the tests that need them
+//! say so and leave themselves out.
 
 use std::fs;
 use std::io::{Cursor, Write};

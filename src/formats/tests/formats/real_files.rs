@@ -8,7 +8,8 @@ fn is_about(found: f64, expected: f64) -> bool {
     (found - expected).abs() <= 1e-12 * expected.abs()
 }
 
-/// A file, and what its map holds: columns and rows, spacing, measured samples, a sample as (column, row, height), least and largest height; mm.
+/// A file, and what its map holds: columns and rows, spacing, measured samples, a sample as (column, row, height),
+/// least and largest height; mm.
 type Known = (&'static str, [usize; 2], [f64; 2], usize, (usize, usize, f64), [f64; 2]);
 
 #[rustfmt::skip]

@@ -38,7 +38,8 @@ pub(crate) fn install() {
         layer.xDelete = Some(delete);
         layer.xAccess = Some(access);
         layer.xSleep = Some(sleep);
-        // SAFETY: what is registered is never freed. The functions that were not replaced look at `pAppData` at most, which is theirs.
+        // SAFETY: what is registered is never freed. The functions that were not replaced look at `pAppData` at most,
+        // which is theirs.
         let registered = unsafe { ffi::sqlite3_vfs_register(Box::leak(Box::new(layer)), 1) };
         assert_eq!(registered, ffi::SQLITE_OK);
         // SAFETY: the function has the form that is asked for, and is there as long as the process.
@@ -59,7 +60,8 @@ unsafe extern "C" fn opened(
     _: *mut *mut c_char,
     _: *const ffi::sqlite3_api_routines,
 ) -> c_int {
-    // SAFETY: SQLite gives a connection that is open; the function has the form that is asked for, and gets that connection.
+    // SAFETY: SQLite gives a connection that is open; the function has the form that is asked for, and gets that
+    // connection.
     unsafe {
         match disk_of_connection(connection) {
             Some(_) => ffi::sqlite3_trace_v2(connection, ffi::SQLITE_TRACE_STMT as _, Some(begun), connection.cast()),

@@ -200,8 +200,8 @@ fn failed_sync_rewritten_before_resume() {
 
 #[test]
 fn uncommitted_record_is_not_read() {
-    // As a program would leave it that was stopped while it wrote to a database without a log: the journal beside it takes back
-    // what stands in the file. A reader that may not write cannot do that.
+    // As a program would leave it that was stopped while it wrote to a database without a log: the journal beside it
+    // takes back what stands in the file. A reader that may not write cannot do that.
     let home = Home::new();
     let folder = home.folder("run");
     drop(Journal::create(&folder, header()).unwrap());

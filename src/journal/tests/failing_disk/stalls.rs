@@ -24,7 +24,8 @@ fn is_read(folder: &Path, records: RangeInclusive<usize>) {
 
 #[test]
 fn stalled_sync_blocks_writer_only() {
-    // The next sync is that of the record in the log. With a log of one page it is brought into the database by those that follow.
+    // The next sync is that of the record in the log. With a log of one page it is brought into the database by those
+    // that follow.
     for (pages, after) in [(1000, 0), (1, 0), (1, 1), (1, 2), (1, 3)] {
         let home = Home::new();
         let folder = home.folder("run");
