@@ -126,7 +126,7 @@ fn solve_first(m: [[f64; 3]; 3], b: [f64; 3]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::program::Waypoint;
+    use crate::motion::Waypoint;
     use crate::spec::WorldSpec;
 
     /// Returns a part of the default world, with a raster of ball centres over it that leaves a given height over x and

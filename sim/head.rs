@@ -10,7 +10,7 @@
 //! program says.
 
 use crate::Vec3;
-use crate::program::{Program, Waypoint};
+use crate::motion::Waypoint;
 
 /// Rotary head.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -49,24 +49,6 @@ impl Head {
         let slides = to.position_at(from.at_mm, share);
         let ends = from.rotary_deg.or(to.rotary_deg).zip(to.rotary_deg);
         ends.map_or(slides, |(a, b)| self.centre_mm(slides, a + share * (b - a)))
-    }
-
-    /// Returns the reason why this head cannot execute a program, or `None` if it can.
-    pub(crate) fn refusal_reason(&self, program: &Program) -> Option<String> {
-        let letter = program.axis?;
-        if letter != self.letter {
-            return Some(format!("the program turns {letter}, and this machine has {}", self.letter));
-        }
-        if self.pivot_mm.is_some() && program.keeps_centre {
-            return Some("the program uses tool centre point control, and this control moves only the slides".into());
-        }
-        if self.pivot_mm.is_none() && !(program.keeps_centre || program.by_kinematics) {
-            return Some("the program moves only the slides, and this control keeps the wheel's centre".into());
-        }
-        let [least, most] = self.range_deg;
-        let turns = program.waypoints.iter().filter_map(|stop| stop.rotary_deg);
-        let beyond = turns.into_iter().find(|turn| !(least - 1e-6..=most + 1e-6).contains(turn));
-        beyond.map(|turn| format!("{letter} {turn} is beyond {least} to {most} degrees"))
     }
 }
 

@@ -52,6 +52,7 @@ pub mod grinder;
 mod handshake;
 pub mod head;
 pub mod hits;
+pub mod motion;
 pub mod options;
 pub mod part;
 pub mod payload;

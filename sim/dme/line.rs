@@ -3,6 +3,7 @@
 use std::fmt;
 
 use super::faults::Fault;
+use crate::Vec3;
 
 /// Tag of a command.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -202,6 +203,17 @@ fn number(text: &str) -> Result<f64, u16> {
         return Err(509);
     }
     text.parse().ok().filter(|n: &f64| n.is_finite()).ok_or(509)
+}
+
+/// Line of a scan.
+#[derive(Clone, Debug)]
+pub(super) struct Scanned {
+    /// Time at which it is sent, in the machine's time from the beginning, in s.
+    pub(super) seconds: f64,
+    /// Position of the probe at that time.
+    pub(super) at_mm: Vec3,
+    /// Points, each as its fields.
+    pub(super) points: Vec<Vec<String>>,
 }
 
 #[cfg(test)]

@@ -45,7 +45,7 @@ pub struct CommandResult {
     /// Warnings, which stop nothing.
     pub warnings: Vec<DmeError>,
     /// Lines that are sent while the machine moves.
-    pub(super) scanned: VecDeque<super::scan::Scanned>,
+    pub(super) scanned: VecDeque<super::line::Scanned>,
     /// Touch that the command made.
     pub(super) touched: Option<MachineEvent>,
 }

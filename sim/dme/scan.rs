@@ -2,23 +2,13 @@
 
 use super::faults::Fault;
 use super::line::Argument;
+use super::line::Scanned;
 use super::machine::{CommandResult, DmeMachine};
 use crate::Vec3;
 use crate::cmm::TouchResult;
 
 /// Number of points in a line.
 const IN_A_LINE: usize = 7;
-
-/// Line of a scan.
-#[derive(Clone, Debug)]
-pub(super) struct Scanned {
-    /// Time at which it is sent, in the machine's time from the beginning, in s.
-    pub(super) seconds: f64,
-    /// Position of the probe at that time.
-    pub(super) at_mm: Vec3,
-    /// Points, each as its fields.
-    pub(super) points: Vec<Vec<String>>,
-}
 
 impl DmeMachine {
     /// Scans an open curve: touches each target of the curve, and returns the measured points and the duration.

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use crate::Vec3;
-use crate::program::{CircularArc, Waypoint};
+use crate::motion::{CircularArc, Waypoint};
 
 /// Maximum number of motions that are read ahead.
 const MAX_QUEUED_STEPS: usize = 200;

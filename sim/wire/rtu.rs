@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite};
 
+use super::answer::{After, Framing, Units, answer};
 use super::faults::SharedFaultPlan;
-use super::{After, Framing, Units, answer};
 use crate::register_encoding::crc16;
 
 /// Silence after which an incomplete frame is dropped. It is far longer than 3.5 characters, since a busy computer

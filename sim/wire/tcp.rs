@@ -7,8 +7,8 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpListener;
 use tokio::task::JoinSet;
 
+use super::answer::{After, Framing, Units, answer};
 use super::faults::SharedFaultPlan;
-use super::{After, Framing, Units, answer};
 
 /// Answers Modbus TCP requests of any number of clients that connect to `listener`. `units` are the simulated machines
 /// with their unit ids. `faults` are the simulated faults. Runs until its future is dropped. All connections are then

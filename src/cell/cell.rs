@@ -229,10 +229,7 @@ impl Cell {
     /// Returns the machine about which the cell is asking a person: "is this machine clear of the part?". Returns
     /// `None` if the cell is not asking this.
     pub fn clear_confirmation_device(&self) -> Option<Device> {
-        self.state
-            .phase()
-            .filter(|phase| self.is_asking_whether_clear(*phase))
-            .and_then(super::transitions::device_awaited_clear)
+        self.state.phase().filter(|phase| self.is_asking_whether_clear(*phase)).and_then(Phase::device_awaited_clear)
     }
 
     /// Returns the time at which the caller must send `Event::Deadline`, measured from the beginning of the run.

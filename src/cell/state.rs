@@ -156,6 +156,16 @@ impl Phase {
             Self::Compensate => "Compensate",
         }
     }
+
+    /// Returns the machine that must be clear of the part before this phase can end. At the step Clear of a job, this
+    /// is the machine without the job. In the phase Transfer, it is the grinder. Returns `None` for any other phase.
+    pub(crate) fn device_awaited_clear(self) -> Option<Device> {
+        match self.job() {
+            Some((device, JobStep::Clear)) => Some(device.other()),
+            None if self == Self::Transfer => Some(Device::Grinder),
+            _ => None,
+        }
+    }
 }
 
 impl fmt::Display for Phase {

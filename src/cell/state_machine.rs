@@ -8,8 +8,7 @@ use super::command::Command;
 use super::event::{Event, JobResult, MachineRequest};
 use super::state::{Device, JobStep, Phase, State};
 use super::transitions::{
-    awaits_answer, device_awaited_clear, device_awaiting_acknowledge, reason_clause, reconciling_device, restart_phase,
-    running_device,
+    awaits_answer, device_awaiting_acknowledge, reason_clause, reconciling_device, restart_phase, running_device,
 };
 
 use Phase::{Compensate, Grind, Load, Measure, Register};
@@ -208,13 +207,13 @@ impl Cell {
             (Execute(p) | Holding(p), Event::PlanLoaded { .. }) if p == Measure(JobStep::Send) => {
                 self.advance(Measure(JobStep::Clear));
             }
-            (Execute(p) | Holding(p), Event::Cleared { device }) if device_awaited_clear(p) == Some(*device) => {
+            (Execute(p) | Holding(p), Event::Cleared { device }) if p.device_awaited_clear() == Some(*device) => {
                 self.on_cleared(p, *device);
             }
-            (Execute(p) | Holding(p), Event::ClearUnknown { device }) if device_awaited_clear(p) == Some(*device) => {
+            (Execute(p) | Holding(p), Event::ClearUnknown { device }) if p.device_awaited_clear() == Some(*device) => {
                 self.on_clear_unknown(p, *device);
             }
-            (Execute(p) | Holding(p), Event::Obstructed { device, message }) if device_awaited_clear(p) == Some(*device) => {
+            (Execute(p) | Holding(p), Event::Obstructed { device, message }) if p.device_awaited_clear() == Some(*device) => {
                 self.raise(AlarmId::NotClear, &format!("{device}, {message}"));
                 self.enter_state(Held(restart_phase(p)));
             }

@@ -366,7 +366,7 @@ impl Cell {
         self.machine_mut(device).clear_confirmed = true;
         if let Execute(phase) = self.state
             && self.is_asking_whether_clear(phase)
-            && device_awaited_clear(phase) == Some(device)
+            && phase.device_awaited_clear() == Some(device)
         {
             self.on_cleared(phase, device);
         }
@@ -375,7 +375,7 @@ impl Cell {
     /// Returns true if `phase` waits until a machine is clear of the part, and the cell is asking a person whether this
     /// is so.
     pub(super) fn is_asking_whether_clear(&self, phase: Phase) -> bool {
-        device_awaited_clear(phase).is_some_and(|device| self.machine(device).clear_requested)
+        phase.device_awaited_clear().is_some_and(|device| self.machine(device).clear_requested)
     }
 
     /// Sends START to the machine `device` if the other machine is known to be clear of the part. The other machine was
@@ -910,7 +910,7 @@ impl Cell {
     /// If `phase` does not need this machine, the cell continues.
     pub(super) fn on_link_lost(&mut self, phase: Phase, device: Device, reason: &str, wait: fn(Phase) -> State) {
         self.set_link_lost(device, true);
-        let needed = phase.job().map(|(job, _)| job) == Some(device) || device_awaited_clear(phase) == Some(device);
+        let needed = phase.job().map(|(job, _)| job) == Some(device) || phase.device_awaited_clear() == Some(device);
         let fails_again = self.count_failure(device);
         // The cell continues without a machine that it does not need.
         let is_vain = fails_again && needed;
@@ -954,7 +954,7 @@ impl Cell {
             state => {
                 let Some(phase) = state.phase() else { return };
                 let needed =
-                    phase.job().map(|(job, _)| job) == Some(device) || device_awaited_clear(phase) == Some(device);
+                    phase.job().map(|(job, _)| job) == Some(device) || phase.device_awaited_clear() == Some(device);
                 if needed {
                     self.enter_state(Held(phase_after_link_loss(phase)));
                 } else if let Execute(_) | Unholding(_) | Unsuspending(_) = state {
@@ -1396,16 +1396,6 @@ fn phase_after_link_loss(phase: Phase) -> Phase {
     match phase.moving_device() {
         Some(device) => Phase::from_job(device, JobStep::Reconcile),
         None => restart_phase(phase),
-    }
-}
-
-/// Returns the machine that must be clear of the part before `phase` can end. At the step Clear of a job, this is the
-/// machine without the job. In the phase Transfer, it is the grinder. Returns `None` for any other phase.
-pub(super) fn device_awaited_clear(phase: Phase) -> Option<Device> {
-    match phase.job() {
-        Some((device, JobStep::Clear)) => Some(device.other()),
-        None if phase == Transfer => Some(Device::Grinder),
-        _ => None,
     }
 }
 
