@@ -139,7 +139,9 @@ fn sources(room: &str) -> Vec<Source> {
 
 /// Removes comments, and the tests at the end of a file.
 fn code_of(text: &str) -> String {
-    let before_tests = text.split("#[cfg(test)]\nmod ").next().unwrap_or(text);
+    let tests =
+        ["mod ", "pub(super) mod ", "pub(crate) mod "].map(|begin| text.find(&format!("#[cfg(test)]\n{begin}")));
+    let before_tests = &text[..tests.into_iter().flatten().min().unwrap_or(text.len())];
     before_tests.lines().map(|line| line.split("//").next().unwrap_or(line)).fold(String::new(), |mut code, line| {
         code.push_str(line);
         code.push('\n');
@@ -343,7 +345,7 @@ fn library_does_not_use_cli() {
 }
 
 /// Number of circles that are left. It may only fall.
-const CIRCLES: usize = 28;
+const CIRCLES: usize = 18;
 
 /// Root files of the crates.
 const CRATES: [&str; 16] = [

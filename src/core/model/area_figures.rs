@@ -10,16 +10,6 @@ use serde::Serialize;
 use super::{Interval, ModelInputs};
 use crate::form::{IsoFits, IsoFormValues, SlopeOperator};
 
-/// Options for the figures of an area.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct AreaOptions {
-    /// Centre of symmetry, x and y of the model frame; `None` for the centre of the bounds of the places.
-    pub middle_mm: Option<[f64; 2]>,
-    /// Integration length of the slopes. It is increased if the places are too far apart for it. `None` for the
-    /// shortest length that the places allow.
-    pub integration_mm: Option<f64>,
-}
-
 /// Slopes of the smooth form. Their uncertainty includes the uncertainty of the pose and the noise of the probe. Form
 /// that is too narrow to be distinguished from noise is not included, because its slope cannot be measured.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]

@@ -8,10 +8,10 @@ use faer::linalg::solvers::{Llt, Solve};
 use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector};
 
-use super::form::SampledForms;
 use super::hypotheses::FieldHypotheses;
 use super::machine_uncertainty::UncertaintySource;
 use super::posterior::Posterior;
+use super::sampled_forms::SampledForms;
 use super::{Observations, orthonormal_base};
 
 /// Contribution of one source to the standard uncertainties of the figures; the squares of all contributions add up.

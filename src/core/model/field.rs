@@ -4,6 +4,7 @@ use faer::Mat;
 
 use super::ModelError;
 use super::matern::Correlation;
+use super::matern::Smoothness;
 
 /// Random field with mean 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -19,17 +20,6 @@ pub struct Field {
     pub anisotropy: Anisotropy,
 }
 
-/// Smoothness of a field: the nu of its Matern covariance, or how many times it can be differentiated.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Smoothness {
-    /// nu = 1/2, exp(-2 r / range): the roughest, nowhere differentiable.
-    Exponential,
-    /// nu = 2: differentiable once.
-    Matern2,
-    /// nu = infinity, exp(-2 (r / range)^2): differentiable any number of times.
-    SquaredExponential,
-}
-
 /// Anisotropy of a field: its range along one direction is longer than across it, as in the tracks of a grinding wheel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Anisotropy {
@@ -37,28 +27,6 @@ pub struct Anisotropy {
     pub along: [f64; 2],
     /// Ratio of the range along to the range across; 1 if all directions are alike.
     pub stretch: f64,
-}
-
-impl Smoothness {
-    /// Returns the parameter nu of the Matern covariance; `None` for [`Smoothness::SquaredExponential`], where nu is
-    /// infinite.
-    pub(super) fn nu(self) -> Option<f64> {
-        match self {
-            Self::Exponential => Some(0.5),
-            Self::Matern2 => Some(2.0),
-            Self::SquaredExponential => None,
-        }
-    }
-
-    /// Returns a word that says how many times the field can be differentiated: `never`, `once` or `endless` (any
-    /// number of times).
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Exponential => "never",
-            Self::Matern2 => "once",
-            Self::SquaredExponential => "endless",
-        }
-    }
 }
 
 impl Anisotropy {

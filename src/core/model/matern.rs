@@ -9,8 +9,6 @@
 
 use std::sync::OnceLock;
 
-use super::Smoothness;
-
 /// Number of steps of the table per unit of x, and largest x of the table. The correlation and its slope are below
 /// 1e-14 there.
 const STEPS: usize = 256;
@@ -86,6 +84,39 @@ fn bessel(nu: f64, x: f64) -> f64 {
         }
     }
     STEP * sum
+}
+
+/// Smoothness of a field: the nu of its Matern covariance, or how many times it can be differentiated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Smoothness {
+    /// nu = 1/2, exp(-2 r / range): the roughest, nowhere differentiable.
+    Exponential,
+    /// nu = 2: differentiable once.
+    Matern2,
+    /// nu = infinity, exp(-2 (r / range)^2): differentiable any number of times.
+    SquaredExponential,
+}
+
+impl Smoothness {
+    /// Returns the parameter nu of the Matern covariance; `None` for [`Smoothness::SquaredExponential`], where nu is
+    /// infinite.
+    pub(super) fn nu(self) -> Option<f64> {
+        match self {
+            Self::Exponential => Some(0.5),
+            Self::Matern2 => Some(2.0),
+            Self::SquaredExponential => None,
+        }
+    }
+
+    /// Returns a word that says how many times the field can be differentiated: `never`, `once` or `endless` (any
+    /// number of times).
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Exponential => "never",
+            Self::Matern2 => "once",
+            Self::SquaredExponential => "endless",
+        }
+    }
 }
 
 #[cfg(test)]

@@ -1,7 +1,5 @@
 //! Warnings about a fit that succeeded: a probe radius that does not match the ball, and too few usable points.
 
-use crate::geometry::Point;
-
 use super::deviation::{Deviation, PointStatus, StatusCounts};
 use super::isolated_touches::count_contradicted;
 use super::options::{Method, RegistrationOptions, Start};
@@ -9,6 +7,7 @@ use super::part::Part;
 use super::quality::format_length;
 use super::result::{FiguresWithOutliers, Registration};
 use super::start::sample_evenly;
+use crate::geometry::Point;
 
 /// Maximum ratio of the rms with another radius to the rms with the given radius, at which the given radius is doubted.
 /// On a free-form surface of 64 mm radius, half the radius leaves a quarter in addition to the form error of a ground
@@ -264,7 +263,7 @@ fn refit_with_radius(
         ..*given
     };
     let part = Part::new(part.nominal, sample, &options).ok()?;
-    super::fit(&part, sample, &options).ok()
+    super::fit::fit(&part, sample, &options).ok()
 }
 
 /// Returns true if `other_rms_mm`, the rms deviation with another probe radius, is much smaller than `rms_mm`, the rms

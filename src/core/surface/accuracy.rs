@@ -11,15 +11,15 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::grid_recognition::NO_POINT;
-use crate::geometry::{Point, Vector, bounds, recognise_grid};
-
 use super::error::SurfaceError;
+use super::facet::FacetIndex;
 use super::facet::Side;
 use super::nominal::{Nominal, check_grid};
 use super::normals::tangents;
-use super::offset::{DistanceModel, FacetIndex, OffsetSurface};
+use super::offset::{DistanceModel, OffsetSurface};
 use super::plane_projection::{PlaneProjection, Projector, is_line};
+use crate::geometry::grid_recognition::NO_POINT;
+use crate::geometry::{Point, Vector, bounds, recognise_grid};
 
 /// Spacings of the two coarser samplings of a grid, in spacings of the whole grid.
 const GRID_STRIDES: [usize; 2] = [3, 6];

@@ -17,9 +17,8 @@
 //!
 //! The code is generic over [`Real`], so that the same code works for one facet and for four in parallel lanes.
 
-use crate::geometry::{Point, Vector};
-
 use super::simd::{F64x4, LANES, Real, Vector3x4, cross, dot, minus, times};
+use crate::geometry::{Point, Vector};
 
 /// Point of a surface with its unit normal. A point location needs both; they are adjacent in memory, because two
 /// separate arrays would need twice the cache lines.
@@ -221,4 +220,35 @@ pub(crate) fn vertices_x4([a, b, c, d]: &[Vertex; LANES]) -> (Vector3x4, Vector3
 pub(crate) fn points_x4(points: &[Point; LANES]) -> Vector3x4 {
     let [a, b, c, d] = points;
     [F64x4([a.x, b.x, c.x, d.x]), F64x4([a.y, b.y, c.y, d.y]), F64x4([a.z, b.z, c.z, d.z])]
+}
+
+/// Facet as the start of a search: the facet where the last search for this point ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FacetIndex {
+    pub(super) patch: u32,
+    pub(super) facet: u32,
+}
+
+impl FacetIndex {
+    /// Unknown facet: the search chooses its own start.
+    pub const UNKNOWN: Self = Self { patch: 0, facet: u32::MAX };
+
+    /// Combines the number `patch` of a patch and the number `facet` of a facet in this patch into one index.
+    pub(crate) fn new(patch: u32, facet: u32) -> Self {
+        Self { patch, facet }
+    }
+
+    /// Creates the index of the facet with the number `facet` in the first patch (patch 0). Use it for a surface that
+    /// has a single patch.
+    pub(crate) fn in_first_patch(facet: u32) -> Self {
+        Self { patch: 0, facet }
+    }
+
+    pub(crate) fn patch(self) -> u32 {
+        self.patch
+    }
+
+    pub(crate) fn facet(self) -> u32 {
+        self.facet
+    }
 }

@@ -3,14 +3,14 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::Vector;
-
 use super::error::SurfaceError;
+use super::facet::FacetIndex;
 use super::facet::{Facets, Vertex, vertices_x4};
 use super::grid_topology::GridTopology;
-use super::offset::{FacetIndex, OffsetSurface};
+use super::offset::OffsetSurface;
 use super::patch::{Patch, Topology};
 use super::simd::{F64x4, LANES, Real, Vector3x4, dot, minus, times};
+use crate::geometry::Vector;
 
 /// Maximum number of facets of a mesh that are checked in addition to those near the measured points. It is limited
 /// because a mesh fits a normal only when it is needed.

@@ -4,20 +4,19 @@ use std::sync::OnceLock;
 
 use rayon::prelude::*;
 
-use crate::geometry::grid_recognition::recognise_ordered_grid;
-use crate::geometry::{Aperture, Point, PointTree, Vector, recognise_grid};
-
 use super::curvature_feature::{CurvatureFeature, fit_features};
 use super::delaunay;
 use super::error::SurfaceError;
+use super::facet::FacetIndex;
 use super::facet::Vertex;
 use super::grid_topology::{GridTopology, fit_grid_nodes, reorder_to_grid};
 use super::mesh_topology::MeshTopology;
 use super::nominal_noise;
 use super::normals;
-use super::offset::FacetIndex;
 use super::patch::{Patch, Topology};
 use super::plane_projection::{PlaneProjection, is_line, principal_axes};
+use crate::geometry::grid_recognition::recognise_ordered_grid;
+use crate::geometry::{Aperture, Point, PointTree, Vector, recognise_grid};
 
 /// Nominal surface: one or several patches of points with normals, to which distances can be computed.
 #[derive(Debug)]

@@ -1,13 +1,13 @@
 //! Offset surface, on which the centre of a probe travels, and the projection of a point onto it. The formulas are in
 //! [`super::facet`].
 
-use crate::geometry::{Point, Vector};
-
 use super::error::SurfaceError;
+use super::facet::FacetIndex;
 use super::facet::{Facet, Facets, Side, offset_corner};
 use super::nominal::Nominal;
 use super::patch::{Patch, Topology};
 use super::simd::{dot, minus};
+use crate::geometry::{Point, Vector};
 
 /// Shape of the surface between the corners of a facet.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
@@ -40,37 +40,6 @@ pub struct OffsetSurface<'a> {
     side: Side,
     distance_model: DistanceModel,
     lookup: Lookup,
-}
-
-/// Facet as the start of a search: the facet where the last search for this point ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct FacetIndex {
-    patch: u32,
-    facet: u32,
-}
-
-impl FacetIndex {
-    /// Unknown facet: the search chooses its own start.
-    pub const UNKNOWN: Self = Self { patch: 0, facet: u32::MAX };
-
-    /// Combines the number `patch` of a patch and the number `facet` of a facet in this patch into one index.
-    pub(crate) fn new(patch: u32, facet: u32) -> Self {
-        Self { patch, facet }
-    }
-
-    /// Creates the index of the facet with the number `facet` in the first patch (patch 0). Use it for a surface that
-    /// has a single patch.
-    pub(crate) fn in_first_patch(facet: u32) -> Self {
-        Self { patch: 0, facet }
-    }
-
-    pub(crate) fn patch(self) -> u32 {
-        self.patch
-    }
-
-    pub(crate) fn facet(self) -> u32 {
-        self.facet
-    }
 }
 
 /// Projection of a point onto the offset surface.

@@ -6,11 +6,11 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::Point;
-
+use super::facet::FacetIndex;
 use super::facet::Facets;
-use super::offset::{FacetIndex, OffsetSurface};
+use super::offset::OffsetSurface;
 use super::patch::Topology;
+use crate::geometry::Point;
 
 /// Number of points per task.
 const CHUNK: usize = 512;

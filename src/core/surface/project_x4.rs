@@ -6,8 +6,9 @@
 //! Points beyond the edge of the surface, and points farther away, use the single search. The results agree except for
 //! rounding.
 
+use super::facet::FacetIndex;
 use super::facet::{Corner, Facet, Facets, offset_corner, vertices_x4};
-use super::offset::{DistanceModel, FacetIndex, Lookup, MIN_INSIDE_WEIGHT, OffsetSurface};
+use super::offset::{DistanceModel, Lookup, MIN_INSIDE_WEIGHT, OffsetSurface};
 use super::patch::{Patch, Topology};
 use super::simd::{F64x4, LANES, Real, Vector3x4};
 

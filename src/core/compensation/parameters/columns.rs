@@ -1,7 +1,7 @@
 //! Columns of the fit: effects on the deviations of a unit of each parameter, of each motion and of the machine's
 //! slides.
 
-use super::{ParameterKind, SurfacePoint, WheelTerm};
+use super::kinds::{ParameterKind, SurfacePoint, WheelTerm};
 use crate::geometry::bounds;
 
 /// Minimum share of a column that is orthogonal to the columns before it. A column with a smaller share counts as a

@@ -4,7 +4,8 @@ use nalgebra::{Matrix6, Vector6};
 use serde::{Deserialize, Serialize};
 
 use super::columns::{Extent, motion_effect, slide_effect};
-use super::{ColumnFit, MIN_NZ, ParameterKind, ParameterOptions, SurfacePoint, WheelTerm, estimate_parameters};
+use super::fit::ColumnFit;
+use super::kinds::{MIN_NZ, ParameterKind, ParameterOptions, SurfacePoint, WheelTerm};
 use crate::compensation::path::{HeightField, Jet};
 use crate::geometry::{Grid, Point, Vector};
 
@@ -50,24 +51,6 @@ impl ExplainedDeviation {
     pub fn at(&self, contact: &SurfacePoint) -> f64 {
         self.deviation_with_motion_mm(contact) - self.motion.at(contact)
     }
-}
-
-/// Returns the part of an error map that machine parameters and bent guideways explain, in millimetres, with one value
-/// for each of `nodes`. Returns 0 for all nodes if the parameters cannot be estimated.
-///
-/// Shapes: `values_mm` is the map at the nodes of `grid`. `contacts` are the points at which the part was measured; the
-/// parameters are estimated from the map at these points. `nodes` are the points of the surface at the x and y of the
-/// nodes of `grid`. `options` are the options of the estimation.
-pub fn explained_by_parameters(
-    values_mm: &[f64],
-    grid: &Grid,
-    [contacts, nodes]: [&[SurfacePoint]; 2],
-    options: &ParameterOptions,
-) -> Vec<f64> {
-    let on_part =
-        |c: &SurfacePoint| SurfacePoint { deviation_mm: grid.interpolate(values_mm, [c.point.x, c.point.y]), ..*c };
-    let told = estimate_parameters(&contacts.iter().map(on_part).collect::<Vec<_>>(), None, options);
-    told.map_or_else(|_| vec![0.0; nodes.len()], |told| nodes.iter().map(|node| told.explained.at(node)).collect())
 }
 
 /// Motion of the part that registration fits to a change of the surface.

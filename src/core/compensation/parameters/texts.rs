@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::columns::dot;
-use super::{COVERAGE_FACTOR, EstimatedParameter, MIN_EFFECT_MM2, ParameterKind, ParameterOptions};
+use super::kinds::{COVERAGE_FACTOR, EstimatedParameter, MIN_EFFECT_MM2, ParameterKind, ParameterOptions};
 
 /// Minimum share of another column in an inseparable column, relative to the largest share, at which a message names
 /// it.

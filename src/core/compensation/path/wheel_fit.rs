@@ -3,10 +3,11 @@
 
 use rayon::prelude::*;
 
+use super::groove::wheel_curvatures;
+use super::groove::{groove, relative_to_middle};
 use super::options::{PathOptions, TrackSpacing};
-use super::scallop::{groove, relative_to_middle};
 use super::target_surface::SurfaceCurvature;
-use super::{PathError, TargetSurface, Wheel};
+use super::{PathError, TargetSurface};
 use crate::geometry::{Aperture, Point};
 
 /// Number of places along each axis at which the fit of the wheel to the surface is checked.
@@ -130,15 +131,6 @@ fn fit_at(
     Ok((8.0 * height / groove.curvature_per_mm).sqrt() / groove.stretch)
 }
 
-/// Returns the second fundamental form (the curvatures) of the wheel at the contact point, in 1/mm. The three values
-/// are the curvature in the first tangent direction of `bend`, the mixed term, and the curvature in the second tangent
-/// direction.
-pub(super) fn wheel_curvatures(bend: &SurfaceCurvature, wheel: &Wheel) -> [f64; 3] {
-    let ([around, across], direction) = wheel.curvatures(&bend.contact.normal);
-    let [c, s] = [0, 1].map(|k| direction.dot(&bend.tangents[k]));
-    [around * c * c + across * s * s, (around - across) * s * c, around * s * s + across * c * c]
-}
-
 /// Returns the error for a hollow of the surface that is too narrow for the wheel. The error names the tangent
 /// direction in which the wheel has the least clearance.
 ///
@@ -208,6 +200,7 @@ pub(super) fn check_body(wanted: &TargetSurface, outline: &Aperture, options: &P
 pub(super) mod tests {
     use super::*;
     use crate::compensation::Correction;
+    use crate::compensation::path::Wheel;
     use crate::compensation::path::{HeightField, ToolPath};
     use crate::geometry::{Grid, Vector};
 

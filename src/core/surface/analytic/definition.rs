@@ -22,11 +22,10 @@ use serde::{Deserialize, Serialize};
 use toml::Spanned;
 use toml::de::{DeTable, DeValue, ValueDeserializer};
 
-use super::AnalyticSurface;
+use super::analytic_surface::{AnalyticSurface, OffAxis, SectionFrame};
 use super::conic::{Asphere, AsphereDefinition, Conic, ConicDefinition};
 use super::error::{self, DefinitionError};
 use super::forbes::{Qbfs, QbfsDefinition, Qcon, QconDefinition};
-use super::off_axis::{OffAxis, OffAxisDefinition, SectionFrame};
 use super::polynomial::{XyPolynomial, XyPolynomialDefinition};
 use super::toroid::{Biconic, BiconicDefinition, Toroid, ToroidDefinition};
 use super::zernike::{Zernike, ZernikeDefinition};
@@ -404,6 +403,35 @@ fn line_and_column(text: &str, byte: usize) -> (usize, usize) {
     let before = text.get(..byte).unwrap_or(text);
     let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);
     (before.matches('\n').count() + 1, before[line_start..].chars().count() + 1)
+}
+
+/// Definition of an off-axis section in a file.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct OffAxisDefinition {
+    /// The whole surface, of any kind except an off-axis section.
+    #[cfg_attr(feature = "schema", schemars(with = "WholeFormula"))]
+    pub parent: Box<Formula>,
+    /// Distance of the section's centre from the parent's axis, perpendicular to the axis, in millimetres.
+    pub distance_mm: f64,
+    /// Azimuth of the section's centre in the parent's frame, from x towards y, in degrees.
+    #[serde(default)]
+    pub azimuth_deg: f64,
+    /// The frame of the section.
+    pub frame: SectionFrame,
+}
+
+impl TryFrom<&OffAxisDefinition> for OffAxis {
+    type Error = DefinitionError;
+
+    fn try_from(written: &OffAxisDefinition) -> Result<Self, DefinitionError> {
+        if matches!(*written.parent, Formula::OffAxis(_)) {
+            return Err(DefinitionError::NestedSection { key: "parent".to_owned() });
+        }
+        let parent = written.parent.resolve().map_err(|error| error.in_table("parent"))?;
+        Self::new(parent, written.distance_mm, written.azimuth_deg.to_radians(), written.frame)
+    }
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use super::conic::Conic;
 use super::error::{self, DefinitionError};
-use super::{MAX_EXTRAPOLATION, jacobi};
+use super::jacobi::{self, MAX_EXTRAPOLATION};
 
 /// Maximum number of coefficients of one surface.
 const MAX_COEFFICIENTS: usize = 200;

@@ -46,6 +46,10 @@ fn step(n: f64, b: f64, t: f64, here: (f64, f64), below: (f64, f64)) -> (f64, f6
     (factor * here.0 - a2 * below.0, factor * here.1 + a1 * here.0 - a2 * below.1)
 }
 
+/// Maximum distance from the axis, in normalisation radii, at which polynomials on a disc are evaluated. It is more
+/// than 1 because a sampling has one ring of nodes beyond the aperture.
+pub(super) const MAX_EXTRAPOLATION: f64 = 1.5;
+
 #[cfg(test)]
 mod tests {
     use super::*;

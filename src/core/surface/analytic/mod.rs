@@ -9,132 +9,31 @@
 //!                      (as written)                   (checked)                  (nodes on a grid)
 //! ```
 
+mod analytic_surface;
 mod conic;
 mod definition;
 mod error;
 mod forbes;
 mod jacobi;
-mod off_axis;
+
 mod polynomial;
 mod sampling;
 mod toroid;
 mod zernike;
 
+pub use analytic_surface::{AnalyticSurface, OffAxis, SectionFrame};
 pub use conic::{Asphere, AsphereDefinition, Conic, ConicDefinition};
 pub use definition::{
-    DefinedSurface, Formula, PlaneDefinition, Sampling, SamplingDefinition, SphereDefinition, SurfaceDefinition,
+    DefinedSurface, Formula, OffAxisDefinition, PlaneDefinition, Sampling, SamplingDefinition, SphereDefinition,
+    SurfaceDefinition,
 };
 pub use error::DefinitionError;
 pub use forbes::{Qbfs, QbfsDefinition, Qcon, QconDefinition};
 pub(crate) use jacobi::values as jacobi_values;
-pub use off_axis::{OffAxis, OffAxisDefinition, SectionFrame};
 pub use polynomial::{XyPolynomial, XyPolynomialDefinition};
 pub use sampling::SampledSurface;
 pub use toroid::{Biconic, BiconicDefinition, Toroid, ToroidDefinition};
 pub use zernike::{Zernike, ZernikeDefinition, ZernikeNormalisation, ZernikeNumbering};
-
-use crate::geometry::{Aperture, Vector};
-
-/// Maximum distance from the axis, in normalisation radii, at which polynomials on a disc are evaluated. It is more
-/// than 1 because a sampling has one ring of nodes beyond the aperture.
-const MAX_EXTRAPOLATION: f64 = 1.5;
-
-/// Surface given by a formula, with checked numbers.
-#[derive(Clone, Debug, PartialEq)]
-pub enum AnalyticSurface {
-    /// A conic of revolution; a sphere and a plane are conics too.
-    Conic(Conic),
-    /// A conic plus powers of the distance from the axis, ISO 10110-12.
-    Asphere(Asphere),
-    /// A section of a surface of another kind, away from its axis.
-    OffAxis(OffAxis),
-    /// A curve rotated about a line, or shifted along one.
-    Toroid(Toroid),
-    /// Two conics, one in x and one in y.
-    Biconic(Biconic),
-    /// Powers of x and y.
-    XyPolynomial(XyPolynomial),
-    /// Zernike polynomials.
-    Zernike(Zernike),
-    /// Forbes' polynomials for strong aspheres.
-    Qcon(Qcon),
-    /// Forbes' polynomials for mild aspheres.
-    Qbfs(Qbfs),
-}
-
-impl AnalyticSurface {
-    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y); `None` if the formula has no value or no finite
-    /// slope there.
-    ///
-    /// Units: millimetres; the gradient has none.
-    pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
-        let q = x * x + y * y;
-        let around = |(z, slope): (f64, f64)| (z, [2.0 * x * slope, 2.0 * y * slope]);
-        let found = match self {
-            Self::Conic(conic) => conic.sag_and_derivative(q).map(around),
-            Self::Asphere(asphere) => asphere.sag_and_derivative(q).map(around),
-            Self::Qcon(qcon) => qcon.sag_and_derivative(q).map(around),
-            Self::Qbfs(qbfs) => qbfs.sag_and_derivative(q).map(around),
-            Self::OffAxis(section) => section.sag_and_gradient(x, y),
-            Self::Toroid(toroid) => toroid.sag_and_gradient(x, y),
-            Self::Biconic(biconic) => biconic.sag_and_gradient(x, y),
-            Self::XyPolynomial(polynomial) => polynomial.sag_and_gradient(x, y),
-            Self::Zernike(zernike) => zernike.sag_and_gradient(x, y),
-        };
-        found.filter(|(z, [gx, gy])| z.is_finite() && gx.is_finite() && gy.is_finite())
-    }
-
-    /// Returns the sag z at (x, y), all in millimetres; `None` if the formula has no value or no finite slope there.
-    pub fn sag(&self, x: f64, y: f64) -> Option<f64> {
-        self.sag_and_gradient(x, y).map(|(z, _)| z)
-    }
-
-    /// Returns the unit normal on the +z side of the surface at (`x`, `y`), which are in millimetres. Returns `None` if
-    /// the formula has no value or no finite slope at this place.
-    pub fn normal(&self, x: f64, y: f64) -> Option<Vector> {
-        self.sag_and_gradient(x, y).map(|(_, gradient)| normal_from_gradient(gradient))
-    }
-
-    /// Returns the normalisation radius in mm: the radius of the disc on which the polynomials of the formula are
-    /// defined. For an off-axis section, this is the radius of its parent (the whole surface). Returns `None` if the
-    /// formula is not limited to a disc.
-    fn normalisation_radius_mm(&self) -> Option<f64> {
-        match self {
-            Self::Zernike(zernike) => Some(zernike.normalisation_radius_mm),
-            Self::Qcon(qcon) => Some(qcon.normalisation_radius_mm),
-            Self::Qbfs(qbfs) => Some(qbfs.normalisation_radius_mm),
-            Self::OffAxis(section) => section.parent().normalisation_radius_mm(),
-            _ => None,
-        }
-    }
-
-    /// Returns the largest distance, in mm, between the axis of the formula and a point of `aperture`. For an off-axis
-    /// section, the axis is that of its parent (the whole surface).
-    fn reach_mm(&self, aperture: &Aperture) -> f64 {
-        let Self::OffAxis(section) = self else { return aperture.reach_mm() };
-        let places = aperture.outline_mm(720).into_iter().filter_map(|[x, y]| section.parent_place(x, y));
-        places.map(|[x, y]| x.hypot(y)).fold(0.0, f64::max)
-    }
-
-    /// Returns the number of terms that one evaluation sums, as a measure of its time.
-    fn term_count(&self) -> usize {
-        match self {
-            Self::Conic(_) | Self::Biconic(_) => 1,
-            Self::Asphere(asphere) => asphere.term_count(),
-            Self::Qcon(qcon) => qcon.term_count(),
-            Self::Qbfs(qbfs) => qbfs.term_count(),
-            Self::OffAxis(section) => section.term_count(),
-            Self::Toroid(toroid) => toroid.term_count(),
-            Self::XyPolynomial(polynomial) => polynomial.term_count(),
-            Self::Zernike(zernike) => zernike.term_count(),
-        }
-    }
-}
-
-/// Returns the unit normal on the +z side of a surface z = f(x, y) from the gradient of f.
-fn normal_from_gradient([gx, gy]: [f64; 2]) -> Vector {
-    Vector::new(-gx, -gy, 1.0).normalize()
-}
 
 #[cfg(test)]
 mod test_support {
@@ -172,6 +71,7 @@ mod test_support {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::Vector;
 
     #[test]
     fn sphere_normal_points_up() {

@@ -2,9 +2,9 @@
 
 use rayon::prelude::*;
 
+use super::analytic_surface::normal_from_gradient;
 use super::definition::{DefinedSurface, Sampling};
 use super::error::{self, DefinitionError};
-use super::normal_from_gradient;
 use crate::geometry::{Aperture, Point, Vector};
 
 /// Maximum number of nodes of a sampling.

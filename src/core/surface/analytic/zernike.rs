@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use super::conic::{self, Conic, ConicDefinition};
 use super::error::{self, DefinitionError};
-use super::{MAX_EXTRAPOLATION, jacobi};
+use super::jacobi::{self, MAX_EXTRAPOLATION};
 
 /// Maximum degree n.
 const MAX_DEGREE: u32 = 100;

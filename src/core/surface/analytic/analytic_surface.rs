@@ -1,11 +1,15 @@
-//! Section of a larger surface, away from its axis.
+//! Surface with a formula, which can be a section of a larger surface away from its axis.
 
 use nalgebra::Matrix3;
 use serde::{Deserialize, Serialize};
 
+use super::conic::{Asphere, Conic};
 use super::error::{self, DefinitionError};
-use super::{AnalyticSurface, Formula};
-use crate::geometry::{Point, Vector};
+use super::forbes::{Qbfs, Qcon};
+use super::polynomial::XyPolynomial;
+use super::toroid::{Biconic, Toroid};
+use super::zernike::Zernike;
+use crate::geometry::{Aperture, Point, Vector};
 
 /// Number of steps from the section's centre to a place, if Newton's method does not converge at this place directly.
 const CONTINUATION_STEPS: u32 = 64;
@@ -35,23 +39,6 @@ pub struct OffAxis {
     parent_from_tilted: Matrix3<f64>,
 }
 
-/// Definition of an off-axis section in a file.
-#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields)]
-pub struct OffAxisDefinition {
-    /// The whole surface, of any kind except an off-axis section.
-    #[cfg_attr(feature = "schema", schemars(with = "super::definition::WholeFormula"))]
-    pub parent: Box<Formula>,
-    /// Distance of the section's centre from the parent's axis, perpendicular to the axis, in millimetres.
-    pub distance_mm: f64,
-    /// Azimuth of the section's centre in the parent's frame, from x towards y, in degrees.
-    #[serde(default)]
-    pub azimuth_deg: f64,
-    /// The frame of the section.
-    pub frame: SectionFrame,
-}
-
 impl OffAxis {
     /// Creates an off-axis section of a parent surface. `distance_mm` is the distance of the centre of the section from
     /// the axis of the parent, and `azimuth_rad` its azimuth from x towards y. `frame` is the frame in which the
@@ -75,7 +62,7 @@ impl OffAxis {
         let Some((z, gradient)) = parent.sag_and_gradient(x_mm, y_mm) else {
             return Err(DefinitionError::SectionOffParent { x_mm, y_mm });
         };
-        let parent_from_tilted = min_rotation(&super::normal_from_gradient(gradient));
+        let parent_from_tilted = min_rotation(&normal_from_gradient(gradient));
         Ok(Self { parent: Box::new(parent), frame, centre: Point::new(x_mm, y_mm, z), parent_from_tilted })
     }
 
@@ -179,18 +166,6 @@ impl OffAxis {
     }
 }
 
-impl TryFrom<&OffAxisDefinition> for OffAxis {
-    type Error = DefinitionError;
-
-    fn try_from(written: &OffAxisDefinition) -> Result<Self, DefinitionError> {
-        if matches!(*written.parent, Formula::OffAxis(_)) {
-            return Err(DefinitionError::NestedSection { key: "parent".to_owned() });
-        }
-        let parent = written.parent.resolve().map_err(|error| error.in_table("parent"))?;
-        Self::new(parent, written.distance_mm, written.azimuth_deg.to_radians(), written.frame)
-    }
-}
-
 /// Returns the smallest rotation that maps the z axis to `n`, a unit vector on the +z side.
 fn min_rotation(n: &Vector) -> Matrix3<f64> {
     let s = 1.0 / (1.0 + n.z);
@@ -205,6 +180,103 @@ fn min_rotation(n: &Vector) -> Matrix3<f64> {
         -n.y,
         n.z,
     )
+}
+
+/// Surface given by a formula, with checked numbers.
+#[derive(Clone, Debug, PartialEq)]
+pub enum AnalyticSurface {
+    /// A conic of revolution; a sphere and a plane are conics too.
+    Conic(Conic),
+    /// A conic plus powers of the distance from the axis, ISO 10110-12.
+    Asphere(Asphere),
+    /// A section of a surface of another kind, away from its axis.
+    OffAxis(OffAxis),
+    /// A curve rotated about a line, or shifted along one.
+    Toroid(Toroid),
+    /// Two conics, one in x and one in y.
+    Biconic(Biconic),
+    /// Powers of x and y.
+    XyPolynomial(XyPolynomial),
+    /// Zernike polynomials.
+    Zernike(Zernike),
+    /// Forbes' polynomials for strong aspheres.
+    Qcon(Qcon),
+    /// Forbes' polynomials for mild aspheres.
+    Qbfs(Qbfs),
+}
+
+impl AnalyticSurface {
+    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (x, y); `None` if the formula has no value or no finite
+    /// slope there.
+    ///
+    /// Units: millimetres; the gradient has none.
+    pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
+        let q = x * x + y * y;
+        let around = |(z, slope): (f64, f64)| (z, [2.0 * x * slope, 2.0 * y * slope]);
+        let found = match self {
+            Self::Conic(conic) => conic.sag_and_derivative(q).map(around),
+            Self::Asphere(asphere) => asphere.sag_and_derivative(q).map(around),
+            Self::Qcon(qcon) => qcon.sag_and_derivative(q).map(around),
+            Self::Qbfs(qbfs) => qbfs.sag_and_derivative(q).map(around),
+            Self::OffAxis(section) => section.sag_and_gradient(x, y),
+            Self::Toroid(toroid) => toroid.sag_and_gradient(x, y),
+            Self::Biconic(biconic) => biconic.sag_and_gradient(x, y),
+            Self::XyPolynomial(polynomial) => polynomial.sag_and_gradient(x, y),
+            Self::Zernike(zernike) => zernike.sag_and_gradient(x, y),
+        };
+        found.filter(|(z, [gx, gy])| z.is_finite() && gx.is_finite() && gy.is_finite())
+    }
+
+    /// Returns the sag z at (x, y), all in millimetres; `None` if the formula has no value or no finite slope there.
+    pub fn sag(&self, x: f64, y: f64) -> Option<f64> {
+        self.sag_and_gradient(x, y).map(|(z, _)| z)
+    }
+
+    /// Returns the unit normal on the +z side of the surface at (`x`, `y`), which are in millimetres. Returns `None` if
+    /// the formula has no value or no finite slope at this place.
+    pub fn normal(&self, x: f64, y: f64) -> Option<Vector> {
+        self.sag_and_gradient(x, y).map(|(_, gradient)| normal_from_gradient(gradient))
+    }
+
+    /// Returns the normalisation radius in mm: the radius of the disc on which the polynomials of the formula are
+    /// defined. For an off-axis section, this is the radius of its parent (the whole surface). Returns `None` if the
+    /// formula is not limited to a disc.
+    pub(super) fn normalisation_radius_mm(&self) -> Option<f64> {
+        match self {
+            Self::Zernike(zernike) => Some(zernike.normalisation_radius_mm),
+            Self::Qcon(qcon) => Some(qcon.normalisation_radius_mm),
+            Self::Qbfs(qbfs) => Some(qbfs.normalisation_radius_mm),
+            Self::OffAxis(section) => section.parent().normalisation_radius_mm(),
+            _ => None,
+        }
+    }
+
+    /// Returns the largest distance, in mm, between the axis of the formula and a point of `aperture`. For an off-axis
+    /// section, the axis is that of its parent (the whole surface).
+    pub(super) fn reach_mm(&self, aperture: &Aperture) -> f64 {
+        let Self::OffAxis(section) = self else { return aperture.reach_mm() };
+        let places = aperture.outline_mm(720).into_iter().filter_map(|[x, y]| section.parent_place(x, y));
+        places.map(|[x, y]| x.hypot(y)).fold(0.0, f64::max)
+    }
+
+    /// Returns the number of terms that one evaluation sums, as a measure of its time.
+    pub(super) fn term_count(&self) -> usize {
+        match self {
+            Self::Conic(_) | Self::Biconic(_) => 1,
+            Self::Asphere(asphere) => asphere.term_count(),
+            Self::Qcon(qcon) => qcon.term_count(),
+            Self::Qbfs(qbfs) => qbfs.term_count(),
+            Self::OffAxis(section) => section.term_count(),
+            Self::Toroid(toroid) => toroid.term_count(),
+            Self::XyPolynomial(polynomial) => polynomial.term_count(),
+            Self::Zernike(zernike) => zernike.term_count(),
+        }
+    }
+}
+
+/// Returns the unit normal on the +z side of a surface z = f(x, y) from the gradient of f.
+pub(super) fn normal_from_gradient([gx, gy]: [f64; 2]) -> Vector {
+    Vector::new(-gx, -gy, 1.0).normalize()
 }
 
 #[cfg(test)]
