@@ -178,6 +178,13 @@ pub enum Reconciled {
     },
 }
 
+impl Reconciled {
+    /// Returns an unknown outcome with its reason.
+    pub(crate) fn unknown(reason: &str) -> Self {
+        Self::Unknown { reason: reason.to_owned() }
+    }
+}
+
 /// Command of the handshake.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u16)]

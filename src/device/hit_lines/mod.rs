@@ -8,6 +8,7 @@
 //!  hearing   state of a measurement, and its change by each line
 //!  link      the port and the thread that listens to it
 //!  machine, settings   the machine as the cell sees it, and its settings
+//!  wire                its table of the cell file, and the factory of its driver
 //! ```
 //!
 //! A person, or the machine's own part program, leads the probe; nothing is ever sent. Page for the shop:
@@ -20,10 +21,12 @@ mod machine;
 mod protocol;
 mod settings;
 mod target_list;
+mod wire;
 
 pub use line_splitter::{LineSplitter, ReceivedLine};
 pub use link::HitSource;
 pub use machine::HitLinesCmm;
 pub use protocol::{Hit, LineError, LineFormat, LineParser, Separator};
-pub use settings::{Axes, DataBits, HitLinesSettings, HitLinesWire, Mark};
+pub use settings::HitLinesSettings;
 pub use target_list::Repeated;
+pub use wire::{Axes, DataBits, HitLinesWire, Mark};

@@ -1,8 +1,8 @@
 //! Grammar of the arguments of each command. A server refuses other arguments by error number; a client that follows
 //! the grammar is not refused for its arguments.
 
-use super::command::DmeCommand;
-use super::syntax::{Item, SyntaxError, Tag, arguments, bad};
+use super::command::{DmeCommand, MAX_LINE_LENGTH};
+use super::syntax::{Item, Reader, Strictness, SyntaxError, Tag, arguments, bad, has_stray_blank};
 
 const PART_AXES: &[&str] = &["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C"];
 const CSYS: &[&str] = &["JogDisplayCsy", "JogMoveCsy", "MoveableMachineCsy", "MultipleArmCsy", "PartCsy", "SensorCsy"];
@@ -115,8 +115,53 @@ pub(super) fn names() -> impl Iterator<Item = &'static str> {
     COMMANDS.iter().map(|(name, _)| *name)
 }
 
+impl DmeCommand {
+    /// Parses a command line from a client, as strictly as an I++ DME server must. `line` has no line end. Returns the
+    /// tag and the command.
+    ///
+    /// # Errors
+    /// Returns the I++ DME error number with which a server refuses the line, and the reason.
+    pub fn read(line: &str) -> Result<(Tag, Self), SyntaxError> {
+        if line.len() > MAX_LINE_LENGTH {
+            return Err(SyntaxError { number: 8, reason: "a line of more than 65536 characters" });
+        }
+        if !line.bytes().all(|b| (32..=126).contains(&b)) {
+            return Err(SyntaxError { number: 7, reason: "a character that is not ASCII 32 to 126" });
+        }
+        let (tag, rest) = tagged(line)?;
+        if has_stray_blank(rest) {
+            return Err(arguments("a blank that is not allowed"));
+        }
+        let mut reader = Reader::new(rest, Strictness::Strict);
+        let command = Self::untagged(&mut reader)?;
+        if !reader.is_at_end() {
+            return Err(SyntaxError { number: 507, reason: "there is text after the command" });
+        }
+        if command.is_event() != matches!(tag, Tag::Event(_)) {
+            return Err(SyntaxError { number: 1, reason: "only a command whose name ends in E has an event tag" });
+        }
+        check(&command)?;
+        Ok((tag, command))
+    }
+
+    fn untagged(reader: &mut Reader<'_>) -> Result<Self, SyntaxError> {
+        let illegal = |reason| SyntaxError { number: 507, reason };
+        let text = reader.rest();
+        let end = text.bytes().position(|b| !b.is_ascii_alphanumeric()).unwrap_or(text.len());
+        let name = &text[..end];
+        if !is_known(name) {
+            return Err(illegal("an unknown command"));
+        }
+        *reader = Reader::new(&text[end..], Strictness::Strict);
+        if !reader.eat('(') {
+            return Err(arguments("a command without parentheses"));
+        }
+        Ok(Self::new(name, reader.in_parentheses()?))
+    }
+}
+
 /// Returns true if I++ DME has a command of this name.
-pub(super) fn is_known(name: &str) -> bool {
+fn is_known(name: &str) -> bool {
     names().any(|known| known == name)
 }
 
@@ -125,7 +170,7 @@ pub(super) fn is_known(name: &str) -> bool {
 /// # Errors
 /// Returns the error number with which a server refuses the command: 507 if the command is unknown, otherwise the
 /// number for the invalid arguments.
-pub(super) fn check(command: &DmeCommand) -> Result<(), SyntaxError> {
+fn check(command: &DmeCommand) -> Result<(), SyntaxError> {
     let Some((_, shape)) = COMMANDS.iter().find(|(name, _)| *name == command.name) else {
         return Err(SyntaxError { number: 507, reason: "an unknown command" });
     };
@@ -342,4 +387,18 @@ fn set(parts: &[&str], values: &[Item]) -> Result<(), SyntaxError> {
         (_, 4) => Err(bad("a property to set requires exactly one number")),
         _ => Err(arguments("a property to set requires exactly one number")),
     }
+}
+
+/// Splits `line` into the tag and the rest of the line. The tag has five characters, and one blank follows.
+///
+/// # Errors
+/// Returns an error if the tag is invalid, if its number is 0, or if no blank follows the tag.
+fn tagged(line: &str) -> Result<(Tag, &str), SyntaxError> {
+    let illegal = SyntaxError { number: 1, reason: "an invalid tag" };
+    let tag = line.get(..5).and_then(Tag::read).ok_or(illegal)?;
+    if matches!(tag, Tag::Command(0) | Tag::Event(0)) {
+        return Err(SyntaxError { number: 1, reason: "tags count from 1" });
+    }
+    let rest = line[5..].strip_prefix(' ').ok_or(SyntaxError { number: 2, reason: "no blank after the tag" })?;
+    Ok((tag, rest))
 }

@@ -9,6 +9,7 @@ use super::link::{Link, LinkFault};
 use super::protocol::{ControllerMode, Get, RshReply, RshRequest, Set};
 use super::settings::LinuxcncSettings;
 use crate::error::{DeviceError, DeviceResult};
+use crate::handshake::Fault;
 use crate::handshake::{Answer, MachineCommand, MachineState};
 use crate::{Connector, LineAddress};
 
@@ -44,6 +45,18 @@ pub(super) struct ControllerState {
     pub(super) position: String,
     /// Errors that it reports, each once.
     pub(super) errors: Vec<String>,
+}
+
+impl ControllerState {
+    /// Returns the fault that prevents any job: an open stop circuit, or drives that are off. Returns `None` if there
+    /// is neither.
+    pub(super) fn standing_fault(&self) -> Option<Fault> {
+        match (self.stop_circuit_open, self.drives_on) {
+            (true, _) => Some(Fault::StopCircuit),
+            (false, false) => Some(Fault::Supplies),
+            (false, true) => None,
+        }
+    }
 }
 
 /// Controller at the other end of a connection.

@@ -36,8 +36,6 @@ use crate::handshake::{
 use crate::machine::{Grinder, Interrupt, Machine};
 use crate::modbus::SystemConnector;
 use crate::payload::{CorrectionMap, Identified, Pass, PassRecord};
-use reconcile::unknown;
-use status::standing_fault;
 
 /// Interval between two status queries while waiting for a start or a record.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
@@ -270,7 +268,7 @@ impl Machine for LinuxcncGrinder {
         if !matches!(status.state, MachineState::Aborted | MachineState::Faulted) {
             return Err(self.refused(MachineCommand::Clear, Answer::WrongState));
         }
-        if let Some(fault) = standing_fault(&seen) {
+        if let Some(fault) = seen.standing_fault() {
             return Err(DeviceError::Faulted { machine: self.machine(), state: status.state, fault });
         }
         (self.job, self.aborted, self.fault) = (None, false, Fault::None);
@@ -306,7 +304,9 @@ impl Machine for LinuxcncGrinder {
             }
         }
         if self.job.as_ref().is_none_or(|work| work.program.is_none()) {
-            return Ok(unknown("the folder of programs has no program whose .log file belongs to this job"));
+            return Ok(Reconciled::unknown(
+                "the folder of programs has no program whose .log file belongs to this job",
+            ));
         }
         match self.start_outcome().await? {
             Some(verdict) => Ok(verdict),

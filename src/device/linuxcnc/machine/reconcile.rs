@@ -50,15 +50,15 @@ impl LinuxcncGrinder {
                 return Ok(verdict);
             }
         }
-        let Some(work) = self.job.clone() else { return Ok(unknown("nothing was prepared")) };
+        let Some(work) = self.job.clone() else { return Ok(Reconciled::unknown("nothing was prepared")) };
         match self.record(&work).await? {
             Some(ProgramRecord { begun: 0, ended: 0, .. }) => {
                 self.job = None;
                 let (_, status) = self.read_status().await?;
                 Ok(Reconciled::NotStarted(status))
             }
-            Some(_) => Ok(unknown("the .log file shows the begin of the program, but not the end")),
-            None => Ok(unknown("the .log file of the program is no longer in the folder of programs")),
+            Some(_) => Ok(Reconciled::unknown("the .log file shows the begin of the program, but not the end")),
+            None => Ok(Reconciled::unknown("the .log file of the program is no longer in the folder of programs")),
         }
     }
 
@@ -88,8 +88,4 @@ impl LinuxcncGrinder {
             self.note(error.to_string());
         }
     }
-}
-
-pub(super) fn unknown(reason: &str) -> Reconciled {
-    Reconciled::Unknown { reason: reason.to_owned() }
 }

@@ -5,7 +5,6 @@ use std::sync::Arc;
 use rand::RngExt as _;
 use tokio::time::{Instant, sleep};
 
-use super::status::standing_fault;
 use super::{LinuxcncGrinder, NOT_STARTED_CONFIRMATION, POLL_INTERVAL};
 use crate::error::{DeviceError, DeviceResult};
 use crate::handshake::{Answer, Armed, Fault, Job, MachineCommand, MachineState, Status};
@@ -59,7 +58,7 @@ impl LinuxcncGrinder {
     pub(super) fn check_ready(&self, seen: &ControllerState) -> DeviceResult<()> {
         match () {
             () if seen.stop_circuit_open || !seen.drives_on => {
-                let (state, fault) = (MachineState::Faulted, standing_fault(seen).unwrap_or(Fault::None));
+                let (state, fault) = (MachineState::Faulted, seen.standing_fault().unwrap_or(Fault::None));
                 Err(DeviceError::Faulted { machine: self.machine(), state, fault })
             }
             () if seen.interpreter == Interpreter::Running => Err(self.unready("the controller runs a program")),

@@ -122,7 +122,7 @@ impl LinuxcncGrinder {
         }
         let blank = Status { clear_of_part: is_clear.then_some(true), ..Status::from_state(self.idle_state(seen)) };
         let (still, settles) = (Duration::ZERO, self.settings.record_timeout);
-        let Some(work) = &mut self.job else { return Status { fault: standing_fault(seen), ..blank } };
+        let Some(work) = &mut self.job else { return Status { fault: seen.standing_fault(), ..blank } };
         let is_auto = Some(seen.mode == ControllerMode::Auto);
         let status = Status { job: Some(work.job), automatic: is_auto, ..blank.clone() };
         match work.stage {
@@ -138,7 +138,7 @@ impl LinuxcncGrinder {
             },
             Stage::Prepared if seen.interpreter != Interpreter::Idle => blank,
             Stage::Prepared if seen.stop_circuit_open || !seen.drives_on => {
-                Status { fault: standing_fault(seen), ..status }
+                Status { fault: seen.standing_fault(), ..status }
             }
             Stage::Prepared if seen.program.as_deref() != Some(&work.path) => blank,
             Stage::Prepared => Status { state: MachineState::Prepared, ..status },
@@ -169,15 +169,5 @@ impl LinuxcncGrinder {
         let record = self.record(&work).await?;
         let settles = self.settings.record_timeout;
         Ok(work.judge(&seen, record, settles, settles) == Verdict::Unresolved)
-    }
-}
-
-/// Returns the fault that prevents any job: an open stop circuit, or drives that are off. Returns `None` if there is
-/// neither.
-pub(super) fn standing_fault(seen: &ControllerState) -> Option<Fault> {
-    match (seen.stop_circuit_open, seen.drives_on) {
-        (true, _) => Some(Fault::StopCircuit),
-        (false, false) => Some(Fault::Supplies),
-        (false, true) => None,
     }
 }
