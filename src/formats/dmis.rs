@@ -7,10 +7,11 @@
 
 use std::path::Path;
 
+use regrind_core::geometry::Point;
+
 use super::error::{FormatError, excerpt};
 use super::number::is_believable;
-use super::result::{Content, ResultFile, Statements};
-use regrind_core::geometry::Point;
+use super::result_content::{Content, ResultFile, Statements};
 
 /// Maximum number of points that are read.
 const MAX_POINTS: usize = 5_000_000;

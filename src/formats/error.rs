@@ -5,8 +5,8 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use super::columns::Unit;
 use super::number::LIMIT_MM;
+use super::unit::Unit;
 
 /// Reason why a file could not be read or written. Lines, columns and rows count from 1, bytes and vertices from 0.
 /// `place` is a text that names a line, a byte or an element. `found` is a shortened piece of the file.

@@ -4,9 +4,10 @@
 use std::borrow::Cow;
 use std::path::Path;
 
-use super::columns::{Axes, StatedUnits, Table, Unit, is_unit, split_unit, text_of};
+use super::columns::{Axes, StatedUnits, Table, is_unit, split_unit, text_of};
 use super::error::{FormatError, excerpt};
 use super::number::{Decimal, Evidence, evidence, looks_numeric, without_blanks};
+use super::unit::Unit;
 
 /// Separator between two columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

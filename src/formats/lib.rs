@@ -29,16 +29,18 @@ mod qif;
 pub mod references;
 pub mod registration;
 pub mod result;
+mod result_content;
 pub mod sdf;
 pub mod stl;
 mod system;
+mod unit;
 mod whole;
 pub mod x3p;
 mod xml;
 
 use std::path::Path;
 
-pub use columns::{Columns, Table, Unit};
+pub use columns::{Columns, Table};
 pub use document::{
     Alternative, MeasuredInput, NominalInput, ProgramVersion, RegistrationDocument, StandardUncertainty,
     save_registration,
@@ -67,6 +69,7 @@ pub use registration::{
 pub use sdf::{parse_sdf, read_sdf};
 pub use stl::{StlFile, parse_stl, read_stl};
 pub use system::{OpenToOthers, is_same_file, readable_by_others, user_name};
+pub use unit::Unit;
 pub use whole::read_whole;
 pub use x3p::{MapRecord, X3pFile, escaped, parse_x3p, read_x3p, write_error_map_x3p, write_x3p};
 

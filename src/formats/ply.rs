@@ -7,11 +7,13 @@
 use std::cell::{Cell, RefCell};
 use std::path::Path;
 
-use super::columns::{Unit, check_stated_unit};
+use regrind_core::geometry::{Point, Vector};
+
+use super::columns::check_stated_unit;
 use super::error::{FormatError, excerpt};
 use super::number::{any_number, is_believable};
+use super::unit::Unit;
 use super::whole::{is_degenerate, open};
-use regrind_core::geometry::{Point, Vector};
 
 /// Content of a PLY file.
 #[derive(Clone, Debug, Default, PartialEq)]

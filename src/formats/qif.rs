@@ -9,14 +9,14 @@
 use std::collections::HashMap;
 use std::path::Path;
 
+use regrind_core::geometry::Point;
 use roxmltree::{Document, Node, ParsingOptions};
 
 use super::dmis::index_of;
 use super::error::{FormatError, excerpt};
 use super::number::is_believable;
-use super::result::{Content, Coordinates, ResultFile, Statements};
+use super::result_content::{Content, Coordinates, ResultFile, Statements};
 use super::xml::{Beyond, beyond_bounds};
-use regrind_core::geometry::Point;
 
 /// Maximum number of nodes of a document.
 const MAX_NODES: u32 = 10_000_000;

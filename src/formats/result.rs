@@ -19,110 +19,21 @@
 
 use std::path::Path;
 
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
-
-use super::columns::{Columns, Table, Unit};
+use super::columns::Table;
 use super::error::excerpt;
 use super::height_map::MapPoints;
 use super::layout::{Fields, Layout, Preamble, is_comment};
 use super::measured_map::map_format;
 use super::number::{Decimal, coordinate};
 use super::points::parse_points_with;
+use super::unit::Unit;
 use super::{FormatError, dmis, ply, qif, whole};
-use regrind_core::geometry::Point;
+pub use crate::result_content::{Content, Coordinates, DecimalMark, ResultFile, Statements};
 
 /// Largest result file that is read, in bytes.
 const MAX_BYTES: u64 = 512 << 20;
 /// Bytes at the beginning of a file in which statements are searched.
 const PREAMBLE_BYTES: usize = 64 << 10;
-
-/// Meaning of measured coordinates.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum Coordinates {
-    /// Centres of the probe.
-    Centres,
-    /// Points of the surface.
-    Contacts,
-}
-
-impl Coordinates {
-    fn words(self) -> &'static str {
-        match self {
-            Self::Centres => "centres",
-            Self::Contacts => "contacts",
-        }
-    }
-}
-
-/// The decimal mark of a file.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum DecimalMark {
-    /// Detected from the file.
-    #[default]
-    Auto,
-    /// A point; commas group thousands.
-    Point,
-    /// A comma; points group thousands.
-    Comma,
-}
-
-/// Properties of the result files that the cell states.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Content {
-    /// Meaning of the coordinates, if the cell states it.
-    pub coordinates: Option<Coordinates>,
-    /// The decimal mark.
-    pub decimal: DecimalMark,
-    /// Unit of length of the files: mm, except for a machine that is known to write another one.
-    pub unit: Unit,
-    /// Unit of z, if it differs.
-    pub height_unit: Option<Unit>,
-    /// Columns x, y and z of the files, if their headers do not name them.
-    pub columns: Option<Columns>,
-}
-
-/// Properties of a measurement that a result file states; `None` for a property that it does not state.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Statements {
-    /// Part that the file belongs to.
-    pub part: Option<String>,
-    /// Cycle that the file belongs to.
-    pub cycle: Option<u16>,
-    /// Identity of the plan, 64 hexadecimal digits in lower case.
-    pub plan: Option<String>,
-    /// Meaning of the coordinates.
-    pub coordinates: Option<Coordinates>,
-    /// Unit of length.
-    pub unit: Option<Unit>,
-    /// Radius of the probe.
-    pub probe_radius_mm: Option<f64>,
-    /// Temperature of the part.
-    pub temperature_c: Option<f64>,
-}
-
-/// Content of a result file.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct ResultFile {
-    /// The points in millimetres, in the order of the file, without rows that are switched off.
-    pub points: Vec<Point>,
-    /// Number of the target of each point, if the file has a column `index`.
-    pub indices: Option<Vec<u32>>,
-    /// Name of each point, if the file has a column `name`, `point` or `feature`.
-    pub names: Option<Vec<String>>,
-    /// Meaning of the coordinates, as stated by the file or else by the cell.
-    pub coordinates: Option<Coordinates>,
-    /// Radius of the probe in mm, from a statement or a column.
-    pub probe_radius_mm: Option<f64>,
-    /// Number of rows that were skipped because they are switched off.
-    pub switched_off: usize,
-    /// Notes on ambiguous content of the file and how it was read, in words.
-    pub notes: Vec<String>,
-    /// Properties of the measurement that the file states.
-    pub statements: Statements,
-}
 
 /// Checks that the last line of `text`, a result file, has a line end. If the line end is missing, the file may be cut
 /// within its last number. Formats that have another end mark (PLY, maps, QIF, DMIS) are always accepted. `path` only
@@ -477,6 +388,8 @@ fn same_probe(path: &Path, line: u64, field: &[u8], first: &mut Option<Vec<u8>>)
 
 #[cfg(test)]
 mod tests {
+    use regrind_core::geometry::Point;
+
     use super::*;
 
     fn parse(text: &str, content: &Content) -> Result<ResultFile, FormatError> {

@@ -7,11 +7,13 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use super::columns::{Unit, check_stated_unit};
+use regrind_core::geometry::Point;
+
+use super::columns::check_stated_unit;
 use super::error::{FormatError, excerpt};
 use super::number::{any_number, is_believable};
+use super::unit::Unit;
 use super::whole::{MAX_BYTES, is_degenerate, open};
-use regrind_core::geometry::Point;
 
 /// Number of bytes before the first facet, and of one facet, in binary.
 const BINARY_HEADER: usize = 84;

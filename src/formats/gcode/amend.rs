@@ -12,12 +12,14 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
+use regrind_core::geometry::{Point, Vector};
 use sha2::{Digest, Sha256};
 
+use super::amendment::{Amendment, displacement};
 use super::arc::Arc;
 use super::check::Check;
 use super::control::{AXES, Act, Control, all};
-use super::map::{MapBase, ProgramMap, identity_in};
+use super::map::{MapBase, identity_in};
 use super::number::{push_fixed, rounded};
 use super::read::{Block, GcodeWord, Refusal, block};
 use super::write::UNCORRECTED;
@@ -25,8 +27,6 @@ use super::{GcodeError, hex};
 use crate::is_same_file;
 use crate::registration::Draft;
 use crate::whole::read_whole;
-use regrind_core::compensation::path::{HeightField, TargetSurface, ball_displacement};
-use regrind_core::geometry::{Point, Vector};
 
 /// Largest program that is read, in bytes.
 const MAX_BYTES: u64 = 1 << 30;
@@ -41,34 +41,6 @@ const MAX_SHARE_OUTSIDE_MAP: f64 = 0.95;
 const MAX_WOUND_MM: f64 = 1e-3;
 /// Rounding error of three coordinates with six decimals, in millimetres.
 const ROUNDING_MM: f64 = 2e-6;
-
-/// Settings for the correction of a program.
-#[derive(Debug)]
-pub struct Amendment<'a> {
-    /// Displacement of the surface along its normal over x and y in the program's frame, in millimetres; positive away
-    /// from the part.
-    pub shift: &'a HeightField,
-    /// Nominal surface, for a ball that grinds it; `None` to move the program's points along z.
-    pub along_normals: Option<AlongNormals<'a>>,
-    /// Maximum distance between the new program and the corrected path, in millimetres.
-    pub tolerance_mm: f64,
-    /// Map from which the shift was computed.
-    pub map: &'a ProgramMap,
-    /// Factor by which the map was multiplied.
-    pub gain: f64,
-    /// Maximum displacement of a point, in millimetres; a larger one is rejected.
-    pub max_shift_mm: f64,
-}
-
-/// The nominal surface under a program, for corrections along its normals.
-#[derive(Clone, Copy, Debug)]
-pub struct AlongNormals<'a> {
-    /// The nominal surface, without a correction.
-    pub nominal: &'a TargetSurface,
-    /// Height of the ball's centre above the program's point: 0 if the program moves the centre, the radius if it moves
-    /// the tip.
-    pub centre_above_mm: f64,
-}
 
 /// Summary of a correction.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
@@ -557,25 +529,6 @@ impl<'a> Rewriter<'a> {
             self.text.push(b'\n');
         }
     }
-}
-
-/// Returns the displacement, in millimetres, that the map gives to `at`, a position in the base program. Without a
-/// nominal surface in `amendment`, the displacement is along z. Otherwise it moves the centre of the grinding ball so
-/// that the ground surface shifts along its normals.
-///
-/// # Errors
-/// A position with no nominal surface under it.
-pub(super) fn displacement(amendment: &Amendment, at: &Point) -> Result<Vector, Refusal> {
-    let shift = amendment.shift;
-    let Some(along) = &amendment.along_normals else { return Ok(Vector::z() * shift.at([at.x, at.y]).value) };
-    let centre = at + Vector::z() * along.centre_above_mm;
-    ball_displacement(along.nominal, shift, &centre).ok_or_else(|| {
-        let found = format!("no place of the nominal surface is under x {:.3}, y {:.3}, z {:.3} mm", at.x, at.y, at.z);
-        let remedy = "above a concave part, begin the move at feed closer to the part, because its normals cross high \
-                      above it (approach by G0); otherwise check that the program is in the frame of the \
-                      nominal surface, and that its programmed point is the stated one";
-        (found, remedy)
-    })
 }
 
 /// Returns true for a word that must not be copied to the corrected line. This is so for line numbers, and for words

@@ -6,10 +6,11 @@
 
 use std::collections::BTreeMap;
 
-use super::amend::{Amendment, displacement};
+use regrind_core::geometry::{Point, Vector};
+
+use super::amendment::{Amendment, displacement};
 use super::number::PER_MM;
 use super::read::{Block, Refusal, block};
-use regrind_core::geometry::{Point, Vector};
 
 /// Tolerance for the rounding of three coordinates and of an arc's centre to the last written digit, in millimetres.
 const DIGITS_MM: f64 = 4.0 / PER_MM;

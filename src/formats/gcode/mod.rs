@@ -7,6 +7,7 @@
 //! ```
 
 mod amend;
+mod amendment;
 mod arc;
 mod check;
 mod control;
@@ -18,7 +19,8 @@ mod read;
 mod table;
 mod write;
 
-pub use amend::{AlongNormals, Amended, Amendment, correct_program};
+pub use amend::{Amended, correct_program};
+pub use amendment::{AlongNormals, Amendment};
 pub use dialect::{
     ArcWords, CentreWords, Dialect, DialectError, DialectProblem, Exactness, LINUXCNC, Tilting, Turning,
 };

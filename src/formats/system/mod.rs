@@ -1,5 +1,6 @@
 //! File functions that differ between operating systems: one module each, with the same functions.
 
+mod open_to_others;
 #[cfg(unix)]
 mod unix;
 #[cfg(windows)]
@@ -13,15 +14,7 @@ use unix as here;
 use windows as here;
 
 pub(super) use here::{create_owners, is_socket, link_to, open_to_read, sync_folder};
-
-/// Permission by which users other than the owner can read a file, and the command that removes it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct OpenToOthers {
-    /// Name of the permission.
-    pub how: String,
-    /// Command that removes the permission.
-    pub remedy: String,
-}
+pub use open_to_others::OpenToOthers;
 
 /// Returns the permission that lets users other than the owner read the file `path`, and the command that removes this
 /// permission. Returns `None` if there is no such permission. On Unix, any permission of the group or of other users
