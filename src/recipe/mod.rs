@@ -12,23 +12,23 @@
 
 mod check;
 mod curvature;
+mod sources;
 mod tables;
 
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
-use crate::cell::Tolerance;
-use crate::document::{Document, Problems, RenamedKey, problem_at, read_text, schema_of, sha256};
-use crate::geometry::{Aperture, Pose};
-use crate::measuring::Layout;
-use crate::registration::{self, Coordinate, Start};
-use crate::surface::{DefinedSurface, PlaneProjection};
-
+pub use sources::{MeasuringPattern, NominalSource, TableSettings};
 use tables::RecipeFile;
 pub use tables::{
     Acceptance, Compensation, CycleSettings, Grinding, MeasurementSettings, Micrometres, ParameterTolerances, Part,
     RegistrationSettings, RegistrationStart, SelectionMode, SpindleAxis, Tilt, TiltKind, WheelDimensions,
 };
+
+use crate::cell::Tolerance;
+use crate::document::{Document, Problems, RenamedKey, problem_at, read_text, schema_of, sha256};
+use crate::geometry::Pose;
+use crate::registration::{self, Coordinate, Start};
 
 /// Checked recipe.
 #[derive(Clone, Debug)]
@@ -57,54 +57,6 @@ pub struct Recipe {
     text: String,
     source_sha256: [u8; 32],
     notes: Vec<String>,
-}
-
-/// Format of a table of points, as text from the recipe, for files that do not state their format themselves.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct TableSettings {
-    /// Columns of x, y and z.
-    pub columns: Option<String>,
-    /// Unit. The default is mm.
-    pub unit: Option<String>,
-    /// Unit of z, if it differs from that of x and y.
-    pub height_unit: Option<String>,
-}
-
-/// Source of the nominal surface.
-#[derive(Clone, Debug, PartialEq)]
-pub enum NominalSource {
-    /// File of points, a mesh or a surface definition.
-    File {
-        /// Path of the file. Relative paths of a recipe are relative to the recipe.
-        path: PathBuf,
-        /// Format of a table of points.
-        table: TableSettings,
-        /// Surface onto which scattered points are projected.
-        projection: PlaneProjection,
-        /// Outline of the part, if it is smaller than the points.
-        aperture: Option<Aperture>,
-    },
-    /// Formula.
-    Surface(Box<DefinedSurface>),
-}
-
-/// Pattern of the measured points.
-#[derive(Clone, Debug, PartialEq)]
-pub enum MeasuringPattern {
-    /// Points that Regrind lays out.
-    Generated(Layout),
-    /// Points of a file, in the model frame.
-    File {
-        /// Path of the file. Relative paths of a recipe are relative to the recipe.
-        path: PathBuf,
-        /// Format of a table of points.
-        table: TableSettings,
-    },
-    /// Points that the operator chooses. The machine receives no plan.
-    Free {
-        /// Minimum number of points.
-        min_points: u32,
-    },
 }
 
 /// Keys that have a new name since version 0.2.

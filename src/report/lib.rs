@@ -28,6 +28,7 @@ mod qif;
 mod raster;
 mod record_content;
 mod results;
+mod results_file;
 mod run;
 mod run_history;
 mod simulation_mark;
@@ -39,21 +40,19 @@ mod xml;
 
 use std::path::Path;
 
-use thiserror::Error;
-
-use regrind_formats::{FormatError, write_atomic};
-
 pub use axis::Scale;
 pub use colour::ColourMap;
 pub use dfq::{DfqPart, dfq_of_parts};
 pub use heat_map::HeatMap;
 pub use plot::{Axis, Plot, Series};
 pub use ply::{coloured_ply, save_coloured_ply};
-pub use results::{RUN_DFQ, RUN_QIF, ResultsFormat, run_results, write_run_results};
+use regrind_formats::{FormatError, write_atomic};
+pub use results_file::{RUN_DFQ, RUN_QIF, ResultsFormat, run_results, write_run_results};
 pub use run::{RUN_REPORT, run_report, write_run_report};
 pub use run_history::AlarmHistory;
 pub use states::state_picture;
 pub use summary::{CycleSummary, RunResult, RunSummary, run_summary};
+use thiserror::Error;
 pub use words::{ending_words, in_air, words};
 
 /// Reasons why a figure could not be drawn or saved. The title identifies a figure, and the name identifies one of its

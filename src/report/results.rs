@@ -1,64 +1,15 @@
 //! Results of a run for other quality systems: who measured which part and when, each judged figure with its limit and
 //! uncertainty, and the verdict. Both formats are written from this data alone, so they cannot disagree.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use regrind_cell::{Conformity, Ending, Figures, Tolerance, Verdict};
+use regrind_journal::Record;
+
+use super::ReportError;
 use super::form::read_figures;
 use super::run_history::{CycleHistory, Measurement, RunHistory};
 use super::words::{ending_words, verdict_words};
-use super::{ReportError, dfq, qif};
-use regrind_cell::{Conformity, Ending, Figures, Tolerance, Verdict};
-use regrind_formats::write_atomic;
-use regrind_journal::Record;
-
-/// File name of the results of a run as QIF 3.0, in the run folder.
-pub const RUN_QIF: &str = "results.qif";
-
-/// File name of the results of a run as Q-DAS ASCII, in the run folder.
-pub const RUN_DFQ: &str = "results.dfq";
-
-/// File formats of the results of a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ResultsFormat {
-    /// QIF 3.0 results (ANSI/DMSC), XML.
-    Qif,
-    /// Q-DAS ASCII transfer format, description and values in one file.
-    Dfq,
-}
-
-/// Verifies the record in the run folder `folder`, writes the results of the run in `format`, and returns the path of
-/// the written file. With `path` = `None` the file is `results.qif` or `results.dfq` in the run folder.
-///
-/// # Errors
-/// Fails if the record is missing, does not pass verification or contains no measurement, or if the file cannot be
-/// written.
-pub fn write_run_results(folder: &Path, format: ResultsFormat, path: Option<&Path>) -> Result<PathBuf, ReportError> {
-    let usual = match format {
-        ResultsFormat::Qif => RUN_QIF,
-        ResultsFormat::Dfq => RUN_DFQ,
-    };
-    let path = path.map_or_else(|| folder.join(usual), Path::to_path_buf);
-    write_atomic(&path, run_results(folder, format)?.as_bytes())?;
-    Ok(path)
-}
-
-/// Verifies the record in the run folder `folder` and returns the results of the run as text in `format`. The same
-/// record always gives the same text, byte for byte.
-///
-/// # Errors
-/// Fails if the record is missing or does not pass verification, if a file `figures.json` of a cycle cannot be read, or
-/// if no measurement of the run has figures.
-pub fn run_results(folder: &Path, format: ResultsFormat) -> Result<String, ReportError> {
-    let (story, verified) = RunHistory::read_verified(folder)?;
-    let results = Results::from_history(&story, verified.head.to_string()).with_areas(&story, folder)?;
-    if results.measured.iter().all(|of| of.figures.is_empty()) {
-        return Err(ReportError::NothingMeasured { run: results.run });
-    }
-    Ok(match format {
-        ResultsFormat::Qif => qif::text(&results),
-        ResultsFormat::Dfq => dfq::text(&results),
-    })
-}
 
 /// Content of a file of results. Texts are the same as in the record. Times are RFC 3339 in UTC.
 pub(super) struct Results {
@@ -128,7 +79,7 @@ pub(super) enum LimitStatus {
 }
 
 impl Results {
-    fn from_history(story: &RunHistory, head: String) -> Self {
+    pub(super) fn from_history(story: &RunHistory, head: String) -> Self {
         let begin = story.begin.as_ref().map(Record::value).unwrap_or_default();
         let text = |value: &serde_json::Value| value.as_str().unwrap_or_default().to_owned();
         let content = |key: &str| text(&begin["content"][key]);
@@ -174,7 +125,7 @@ impl Results {
     ///
     /// # Errors
     /// Fails if a file `figures.json` that the history names cannot be read or is not JSON.
-    fn with_areas(mut self, story: &RunHistory, folder: &Path) -> Result<Self, ReportError> {
+    pub(super) fn with_areas(mut self, story: &RunHistory, folder: &Path) -> Result<Self, ReportError> {
         for (cycle, of) in &story.cycles {
             let Some(name) = &of.form else { continue };
             let told = read_figures(&folder.join(name))?;

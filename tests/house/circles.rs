@@ -7,6 +7,9 @@ use std::path::{Path, PathBuf};
 
 use crate::Source;
 
+/// Keywords that stand before the name of an item.
+const KINDS_OF_ITEMS: [&str; 9] = ["struct", "enum", "trait", "type", "const", "static", "fn", "mod", "macro_rules"];
+
 /// Path of a module or of a name, from the root of its crate.
 type ModulePath = Vec<String>;
 
@@ -147,18 +150,12 @@ impl Module {
         let code = without_texts(code);
         let mut defined = BTreeSet::new();
         for line in code.lines().filter(|line| !line.starts_with([' ', '}', ')', '#'])) {
-            let mut words = line.split(|c: char| !c.is_alphanumeric() && c != '_').filter(|word| !word.is_empty());
-            while let Some(word) = words.next() {
-                if matches!(word, "use" | "impl") {
-                    break;
-                }
-                if ["struct", "enum", "trait", "type", "const", "static", "fn", "mod", "macro_rules"].contains(&word) {
-                    if let Some(name) = words.next().filter(|name| *name != "fn" && *name != "unsafe") {
-                        defined.insert(name.to_owned());
-                        break;
-                    }
-                }
-            }
+            let words: Vec<&str> =
+                line.split(|c: char| !c.is_alphanumeric() && c != '_').filter(|word| !word.is_empty()).collect();
+            let is_item = |word: &str| KINDS_OF_ITEMS.contains(&word);
+            let head = words.split(|word| matches!(*word, "use" | "impl")).next().unwrap_or(&[]);
+            let name = head.windows(2).find(|pair| is_item(pair[0]) && !is_item(pair[1]) && pair[1] != "unsafe");
+            defined.extend(name.map(|pair| pair[1].to_owned()));
         }
         let (mut imported, mut rest, mut code) = (Vec::new(), String::new(), code.as_str());
         while let Some(at) = find_word(code, "use ") {

@@ -8,7 +8,8 @@ use crate::sweep::{Swept, clearance, places};
 use regrind::compensation::path::{Move, PathMode, Wheel};
 use regrind::config::read_dialect;
 use regrind::formats::gcode::Dialect;
-use regrind_sim::program::{Control, Program, Waypoint};
+use regrind_sim::motion::Waypoint;
+use regrind_sim::program::{Control, Program};
 
 const DIALECTS: [&str; 4] = ["linuxcnc", "fanuc", "sinumerik", "heidenhain"];
 /// Tolerance of a touching place in a program with unrounded points, in millimetres.

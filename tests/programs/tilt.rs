@@ -8,7 +8,8 @@ use crate::sweep::{distance, places};
 use regrind::compensation::path::{HeightField, PathError, PathOptions, RotaryAxis, RotationAxis, TiltMode, Wheel};
 use regrind::config::read_dialect;
 use regrind::geometry::{Aperture, Grid, Vector};
-use regrind_sim::program::{Control, Program, Waypoint};
+use regrind_sim::motion::Waypoint;
+use regrind_sim::program::{Control, Program};
 
 /// Tolerance of a touching place, in millimetres.
 const WITHIN_MM: f64 = 2e-4;
