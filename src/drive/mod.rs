@@ -15,8 +15,10 @@
 mod adaptive_measurement;
 mod blocking_executor;
 mod comparison;
+mod computation;
 mod cycle_output;
 mod cycles;
+mod failure;
 mod notice;
 mod outcome;
 mod pass_record;
@@ -37,6 +39,8 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use regrind_control::{Control, EndpointChange, ReceivedOrder};
+pub use regrind_control::{CycleRow, JobProgress, PreviewStatistics, Reply, Request, Snapshot, is_live, send_request};
 use serde::Serialize;
 use serde_json::{Value, json};
 use tokio::sync::{mpsc, oneshot, watch};
@@ -51,20 +55,18 @@ use crate::device::{
     AnyCmm, AnyGrinder, Armed, BatchId, Cmm, Grinder, Identified, Interrupt, Job, Measurement, OperatorConfirmation,
     PassRecord, PreliminaryPoints, hex,
 };
-use crate::formats::{FormatError, LEARNED, ResultFolder, write_json_atomic};
+use crate::formats::{LEARNED, write_json_atomic};
 use crate::journal::{self, Artefact, Entry, RecordKind};
-
 pub use blocking_executor::{BlockingExecutor, BlockingWork};
+use computation::{Computation, batch_folder, create_folder, cycle_folder};
 use cycles::Cycles;
+use failure::{failure_message, panic_message};
 pub use notice::Notice;
 use preview::PreviewAccumulator;
-use program::PROGRAM_FILE;
 pub use program::{ProgramError, Programs};
 use progress_estimator::ProgressEstimator;
 pub use recorder::JournalSink;
 use recorder::{OutputFiles, RecordReceipt, Recorder, entry};
-use regrind_control::{Control, EndpointChange, ReceivedOrder};
-pub use regrind_control::{CycleRow, JobProgress, PreviewStatistics, Reply, Request, Snapshot, is_live, send_request};
 pub use replay::{InterruptedRun, ReplayError};
 use station::{
     AbortCounter, CmmDriver, FetchedResult, GrinderDriver, LoopWatchdog, MachineNotes, MachinePayload, MachineTask,
@@ -190,53 +192,6 @@ pub struct Drive {
     control: Control,
 }
 
-/// Kind of computation for a cycle.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum Computation {
-    Gate,
-    Registration,
-    Compensation,
-    /// Registration after the last batch of an adaptive measurement, on which the cell decides.
-    FinalRegistration,
-}
-
-impl Computation {
-    /// Returns the kind of computation that writes a result file of this name; `None` for any other file.
-    fn from_file_name(file: &str) -> Option<Self> {
-        Some(match file {
-            "measured.csv" | "reference_sphere.csv" | "touches.json" => Self::Gate,
-            "correction.csv" | "correction.json" | "toolpath_z.csv" => Self::Compensation,
-            program if program.strip_prefix(PROGRAM_FILE).is_some_and(|end| end.starts_with('.')) => Self::Compensation,
-            "registration.json"
-            | "deviations.csv"
-            | "deviation_uncertainty.csv"
-            | "deviations.ply"
-            | "figures.json"
-            | "parameters.json"
-            | "error_map.csv"
-            | "error_map.x3p"
-            | "error_map.svg"
-            | "error_map.png" => Self::Registration,
-            _ => return None,
-        })
-    }
-}
-
-/// Returns the path of the result folder of a cycle, relative to the run folder. The second and each further `attempt`
-/// has a subfolder of its own, so that recorded files are never overwritten.
-fn cycle_folder(cycle: u32, attempt: u32) -> String {
-    match attempt {
-        0 | 1 => format!("cycle-{cycle}"),
-        attempt => format!("cycle-{cycle}/attempt-{attempt}"),
-    }
-}
-
-/// Returns the path of the folder for the results after batch `batch` of an adaptive measurement, relative to the run
-/// folder.
-fn batch_folder(cycle: u32, batch: u32) -> String {
-    format!("cycle-{cycle}/batch-{batch}")
-}
-
 /// Record that is not yet written, and the action that follows it.
 struct PendingRecord {
     receipt: RecordReceipt,
@@ -256,11 +211,6 @@ fn control_event(change: EndpointChange) -> Event {
         EndpointChange::Lost(reason) => Event::ControlLost { reason },
         EndpointChange::Restored => Event::ControlBack,
     }
-}
-
-/// Creates a folder for results if it does not exist.
-fn create_folder(folder: &Path) -> Result<(), FormatError> {
-    ResultFolder::prepare(folder).map(ResultFolder::keep)
 }
 
 /// Result of a computation.
@@ -1255,13 +1205,6 @@ fn require_free_space(folder: &Path, needed: u64) -> Result<(), RecordFailure> {
     Err(RecordFailure::DiskFull(format!("the disk of {disk} has {free} MB free, but a cycle needs up to {needed} MB")))
 }
 
-/// Returns the message of a task that panicked.
-fn panic_message(error: JoinError) -> String {
-    let Ok(panic) = error.try_into_panic() else { return "the task was cancelled".into() };
-    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
-    text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "no further information".into())
-}
-
 /// Waits until the first entry of the queue is recorded, and returns the result. Returns an error if the entry cannot
 /// be recorded, or if the journal writer has ended. Never returns if the queue is empty.
 async fn wait_for_first_record(backlog: &mut VecDeque<PendingRecord>) -> Result<(), RecordFailure> {
@@ -1272,12 +1215,6 @@ async fn wait_for_first_record(backlog: &mut VecDeque<PendingRecord>) -> Result<
             ))
         }),
         None => std::future::pending().await,
-    }
-}
-
-fn failure_message(failure: &RecordFailure) -> String {
-    match failure {
-        RecordFailure::DiskFull(message) | RecordFailure::Unwritable(message) => message.clone(),
     }
 }
 

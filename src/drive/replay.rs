@@ -21,14 +21,15 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 use thiserror::Error;
 
+use super::Task;
 use super::comparison::{is_same_decision, is_same_file, is_same_result};
+use super::computation::{Computation, batch_folder, create_folder, cycle_folder};
 use super::cycles::Cycles;
 use super::outcome;
 use super::pipeline;
 use super::recorder::OutputFiles;
 use super::station::StartIntent;
 use super::task::ComputationProduct;
-use super::{Computation, Task, batch_folder, create_folder, cycle_folder};
 use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, GateResult, Judgement};
 use crate::device::{Armed, BatchId, Coordinates, Identified, digest};
 use crate::formats::{self, FormatError, ScratchFolder};
@@ -302,7 +303,7 @@ impl<'t> Replay<'t> {
             _ => pipeline::compensate_cycle(self.task, &mut files, number, &cycle),
         };
         if let Event::NotSaved { reason, .. } = again {
-            let what = super::failure_message(&reason);
+            let what = super::failure::failure_message(&reason);
             return Err(ReplayError::NotSaved { run: self.run_folder.to_owned(), what });
         }
         let [recorded, again] = [event, &again].map(|event| serde_json::to_value(event).unwrap_or_default());

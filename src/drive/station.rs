@@ -14,7 +14,7 @@ use serde::Serialize;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
-use super::panic_message;
+use super::failure::panic_message;
 use crate::cell::{
     Condition, ConnectionRefusal, Device, Event, GateFailure, GateResult, JobResult, MachineRequest, Occupation,
     Reconciliation,
