@@ -17,7 +17,7 @@ use super::state::{Device, JobStep, Phase, State};
 
 /// Version of the transition table. A run can be continued only by a program with the version that began the run. Every
 /// change of a reaction requires a new version.
-pub const TABLE_VERSION: u32 = 12;
+pub const TABLE_VERSION: u32 = 13;
 
 /// Reaction to an event in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]

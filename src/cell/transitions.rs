@@ -766,19 +766,19 @@ impl Cell {
     /// - A machine runs its job, and the cell is executing, holding or suspending: nothing is done. HOLD is sent even
     ///   if it is not recorded.
     /// - The step Start: nothing is done. A START that was not sent is reported as refused.
-    /// - A machine was ordered to hold and has not confirmed it: the cell sends HOLD again.
+    /// - The step Reconcile: the machine may be moving, and was not asked for its state. The cell becomes holding, and
+    ///   sends HOLD, until the machine confirms that it is at rest.
     pub(super) fn on_not_recorded(&mut self, phase: Phase) {
-        let runs = matches!(phase.job(), Some((_, JobStep::Run)));
-        match self.state {
+        match (self.state, phase.job()) {
             // HOLD is sent whether it is recorded or not.
-            Execute(_) | Holding(_) | Suspending(_) if runs => {}
+            (Execute(_) | Holding(_) | Suspending(_), Some((_, JobStep::Run))) => {}
             // A START that was not sent is reported as a refusal. Without that report the machine may have moved.
-            _ if matches!(phase.job(), Some((_, JobStep::Start))) => {}
-            // A machine that was ordered to hold must stop, even if the cell has not found out what it does.
-            Holding(_) if self.hold_deadline.is_some() => {
-                if let Some(device) = phase.moving_device() {
-                    self.push(Command::HoldMachine { device });
+            (_, Some((_, JobStep::Start))) => {}
+            (state, Some((device, JobStep::Reconcile))) => {
+                if !matches!(state, Holding(_)) {
+                    self.enter_state(Holding(phase));
                 }
+                self.push(Command::HoldMachine { device });
             }
             _ => self.enter_state(Held(restart_phase(phase))),
         }

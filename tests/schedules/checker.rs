@@ -30,6 +30,10 @@ const ABORTS_WITHIN: Duration = Duration::from_millis(100);
 const RECOVERS_WITHIN: Duration = Duration::from_secs(12);
 /// Time limit for the detection of a machine that moves without an order, until it is held.
 const FOUND_WITHIN: Duration = Duration::from_millis(800);
+/// Maximum age of a report of a machine, with the delays of the wire.
+const REPORTED_WITHIN: Duration = Duration::from_millis(1_500);
+/// Time within which the alarms of a new state are shown.
+const RAISED_WITHIN: Duration = Duration::from_millis(200);
 /// Time limit for the HOLD command to a machine that is found moving, if it is reachable.
 const HOLDS_WITHIN: Duration = Duration::from_secs(4);
 /// Time limit of a transitional state, if nothing but the disk fails.
@@ -46,6 +50,8 @@ pub struct Shown {
     pub phase: Option<Phase>,
     /// Machines that are named as not having confirmed standstill.
     pub unconfirmed: [bool; 2],
+    /// True if an alarm asks a person whether a machine is at rest, because the outcome of its job is unknown.
+    pub asks_to_check: bool,
 }
 
 /// Evidence that a schedule leaves.
@@ -398,17 +404,27 @@ fn waits_for_nothing_for_long(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// Checks that a cell that holds shows Held only after the machine reports that it holds.
+/// Checks that a cell that holds shows Held only after the machine reports that it holds. There are two exceptions. An
+/// alarm asks a person to check a machine that gives no answer. The machine was held, and a person resumed it at its
+/// panel while the report of its standstill was on the wire.
 fn held_when_it_holds(evidence: &Evidence) -> Result<(), String> {
     let states = states(evidence);
-    for pair in evidence.shown.windows(2) {
+    for (k, pair) in evidence.shown.windows(2).enumerate() {
         let [before, now] = pair else { continue };
         if (before.state, now.state) != (Some(StateName::Holding), Some(StateName::Held)) {
             continue;
         }
         let Some(device) = before.phase.and_then(Phase::moving_device) else { continue };
+        let soon = evidence.shown[k + 1..].iter().take_while(|shown| shown.at <= now.at + RAISED_WITHIN);
+        if soon.clone().any(|shown| shown.asks_to_check) {
+            continue;
+        }
         let at = states.partition_point(|(at, _)| *at <= now.at);
-        if states[at - 1].1[device as usize] == State::Execute {
+        let of_it = |k: usize| (states[k].0, states[k].1[device as usize]);
+        let began = (0..at).rev().take_while(|k| of_it(*k).1 == State::Execute).last();
+        let was_held =
+            began.is_some_and(|k| k > 0 && of_it(k - 1).1 == State::Held && of_it(k).0 + REPORTED_WITHIN > now.at);
+        if of_it(at - 1).1 == State::Execute && !was_held {
             return Err(format!("the {device} moves as it is shown to be held at {:.3} s", evidence.seconds(now.at)));
         }
     }

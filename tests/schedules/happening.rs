@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
-use regrind::cell::{Device, Ending};
+use regrind::cell::{AlarmId, Device, Ending};
 use regrind::device::ippdme::Limits;
 use regrind::device::{
     AnyCmm, AnyGrinder, IppdmeCmm, IppdmeSettings, IppdmeWire, Link, LinuxcncGrinder, LinuxcncSettings, LinuxcncWire,
@@ -220,6 +220,7 @@ impl<'s> Happening<'s> {
             state: None,
             phase: None,
             unconfirmed: [false; 2],
+            asks_to_check: false,
         });
         *self.orders.lock().unwrap() = None;
         life.end();
@@ -456,14 +457,16 @@ fn has_events(folder: &Path) -> bool {
 async fn watch(orders: OrderSender, life: Arc<Life>, shown: Arc<Mutex<Vec<Shown>>>) {
     let mut status = orders.status();
     loop {
-        let (state, phase, unconfirmed) = {
+        let (state, phase, unconfirmed, asks_to_check) = {
             let seen = status.borrow_and_update();
-            (seen.state, seen.phase, Device::BOTH.map(|device| seen.unconfirmed.contains(&device)))
+            let asks = |id| matches!(id, AlarmId::StartUnknown | AlarmId::JobVanished);
+            let asks_to_check = seen.alarms.iter().any(|alarm| asks(alarm.id));
+            (seen.state, seen.phase, Device::BOTH.map(|device| seen.unconfirmed.contains(&device)), asks_to_check)
         };
         if life.is_dead() {
             return;
         }
-        shown.lock().unwrap().push(Shown { at: Instant::now(), state: Some(state), phase, unconfirmed });
+        shown.lock().unwrap().push(Shown { at: Instant::now(), state: Some(state), phase, unconfirmed, asks_to_check });
         if status.changed().await.is_err() {
             return;
         }
