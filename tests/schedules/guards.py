@@ -20,7 +20,7 @@ GUARDS = {
         "src/drive/mod.rs", "RecordAction::Execute(command) if self.cell.still_requires(&command) =>", "RecordAction::Execute(command) if true || self.cell.still_requires(&command) =>"),
     "an order is answered when it is on record": (
         "src/drive/mod.rs", "self.backlog.push_back(PendingRecord {\n                receipt: ticket,\n                action: RecordAction::Answer { answer, accepted, message },\n            });",
-        "drop((ticket, answer.send(Reply { taken: accepted, message, status: self.snapshot() })));"),
+        "drop((ticket, answer.send(Reply { accepted, message, status: self.snapshot() })));"),
     "an abort gives up what the machine is asked": (
         "src/drive/station.rs", "() = aborts.wait_for_abort() => {}", "() = std::future::pending() => {}"),
     "an abort waits for no record": (
@@ -39,6 +39,9 @@ GUARDS = {
         "src/drive/station.rs", "if self.observed.connected => if pulse.is_alive() {", "if self.observed.connected && pulse.is_alive() => if true {"),
     "holding goes on when the link is lost": (
         "src/cell/transitions.rs", "        if is_holding && phase.moving_device() == Some(device) {\n", "        if is_holding && phase.moving_device() == Some(device) {\n            self.enter_state(Held(phase_after_link_loss(phase)));\n        } else if false {\n"),
+    "a question that is not on record makes the machine hold": (
+        "src/cell/transitions.rs", "                self.push(Command::HoldMachine { device });\n            }\n            _ => self.enter_state(Held(restart_phase(phase))),", "            }\n            _ => self.enter_state(Held(restart_phase(phase))),",
+        "cell", "unrecorded_reconcile_never_shows_held"),
     "a job found running while holding is told to hold": (
         "src/cell/transitions.rs", "                self.enter_state(self.state_with_phase(run));\n                self.push(Command::HoldMachine { device });\n", "                self.enter_state(self.state_with_phase(run));\n"),
     "a machine that moves while the cell stands is told to hold": (

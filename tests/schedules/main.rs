@@ -34,7 +34,8 @@ use schedule::{FORGETFUL, FULL_DISK, LIARS, OTHER_WIRES, Schedule, Tally};
 /// Seeds that detect a missing guard that few other seeds detect. A station checks again that the loop is alive (134).
 /// A command that waited for a poll that found the link lost is not sent: START (163) and RESUME (181). No command
 /// waits in the queue when a query is sent (264). An abort does not wait for a machine that does not move (585).
-const KEPT: &[u64] = &[134, 163, 181, 264, 585];
+/// A cell that is being held sends HOLD if the disk fails as the link comes back (19,775).
+const KEPT: &[u64] = &[134, 163, 181, 264, 585, 19_775];
 
 /// Seeds of the same kind for machines with a protocol other than Modbus. The connection to linuxcncrsh was lost during
 /// the query for the result of a START, and the link reported it as never established (1,000,075).
