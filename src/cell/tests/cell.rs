@@ -1750,8 +1750,8 @@ fn play_random_events(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> 
     run.start();
     let mut excused = std::collections::BTreeMap::<Device, u32>::new();
     let mut seen = 0;
-    // What was seen of each machine, whether it said that it cannot tell, and what a person said of it since its last
-    // start.
+    // For each machine since its last start: it reported that it is clear, it reported that it cannot know this, and a
+    // person confirmed it.
     let (mut clear, mut unknown, mut said) = ([false; 2], [false; 2], [false; 2]);
     let mut aborted = false;
     // Whether each machine was seen at its job since it was started last: nothing that it says then excuses a second

@@ -4,8 +4,8 @@
 //! crate: those of a folder with a disk obey the [`Fault`]s that were asked for, all others go to the system as before.
 //! So what is tested is opened, written and read as always, and tests of one process do not meet.
 //!
-//! What passes here is what SQLite does with its files: the database, its write-ahead log, its rollback journal, and
-//! the locks and the shared index beside them. What a program does with files by itself does not.
+//! The disk carries out what SQLite does with its files: the database, its write-ahead log, its rollback journal, and
+//! the locks and the shared index beside them. Files that a program writes by itself do not pass through it.
 //!
 //! [`Disk::remembering`] also keeps what a real disk would still hold: the bytes of each file at its last sync, what
 //! was written since, and which names the folder is sure of. Before each change it lays a [`Cut`] by: the moment at
