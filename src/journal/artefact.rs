@@ -9,9 +9,9 @@ use sha2::{Digest, Sha256};
 
 use super::canonical::hex;
 use super::error::JournalError;
+use super::names::{ANCHOR, DATABASE, LOCK};
 use super::open::sync_folder;
 use super::system;
-use super::{ANCHOR, DATABASE, LOCK};
 
 /// Journal entry of a file of the run folder.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

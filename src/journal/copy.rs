@@ -7,9 +7,10 @@ use serde_json::Value;
 use super::artefact::{path_within, write_file};
 use super::canonical::canonical_json;
 use super::error::JournalError;
+use super::names::ANCHOR;
 use super::record::Record;
 use super::verify::Anchor;
-use super::{ANCHOR, open, system};
+use super::{open, system};
 
 impl Record {
     /// Creates a record from `text`, the JSON text of all its fields except the hashes ([`Record::text`]). `prev_hash`

@@ -8,7 +8,8 @@ use std::path::Path;
 use std::str::FromStr;
 
 use ed25519_compact::{KeyPair, Seed, Signature};
-use serde::{Serialize, Serializer};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use sha2::{Digest, Sha256};
 
 use super::canonical::{hex, unhex};
@@ -76,6 +77,12 @@ impl FromStr for PublicKey {
 
     fn from_str(digits: &str) -> Result<Self, ()> {
         unhex(digits).map(Self).ok_or(())
+    }
+}
+
+impl<'de> Deserialize<'de> for PublicKey {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        String::deserialize(deserializer)?.parse().map_err(|()| D::Error::custom("not a public key"))
     }
 }
 

@@ -6,8 +6,8 @@ use std::io::Read;
 use std::path::Path;
 
 use super::error::JournalError;
+use super::names::{ANCHOR, DATABASE};
 use super::verify::read_anchor;
-use super::{ANCHOR, DATABASE};
 
 /// Length in bytes of the header of the log, and of the header of a frame in it (sqlite.org/fileformat.html, "The
 /// Write-Ahead Log").

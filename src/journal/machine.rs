@@ -8,10 +8,11 @@ use std::fs::{File, TryLockError};
 use std::io::{Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
+use super::canonical::sha256_hex;
 use super::error::JournalError;
 use super::locked_file::LockedFile;
+use super::system;
 use super::system::{LockFile, LockFolder};
-use super::{sha256_hex, system};
 
 /// Lock of a machine. While it lives, no other run on this computer can take the machine.
 ///

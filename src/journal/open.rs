@@ -8,8 +8,8 @@ use std::time::Duration;
 use rusqlite::config::DbConfig;
 use rusqlite::{Connection, OpenFlags};
 
-use super::DATABASE;
 use super::error::JournalError;
+use super::names::DATABASE;
 use super::system;
 
 /// Application id `RGrd` in the header of the file; identifies a journal of Regrind.

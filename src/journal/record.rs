@@ -100,9 +100,12 @@ pub struct Entry {
 impl Entry {
     /// Creates an entry (content of a record to be written) with the actor `cell`, the station `regrind`, no command
     /// number and an empty reason. `mono_ns` is the time since the run began, in nanoseconds. `cycle` is the number of
-    /// the cycle, 0 before the first. `payload` is the content of the record.
-    pub fn new(kind: RecordKind, mono_ns: u64, cycle: u32, payload: Value) -> Self {
+    /// the cycle, 0 before the first. `payload` is the content of the record: a JSON value, or a type that is written as
+    /// one.
+    pub fn new(kind: RecordKind, mono_ns: u64, cycle: u32, payload: impl Serialize) -> Self {
         let (actor, station) = ("cell".to_owned(), "regrind".to_owned());
+        // Fails only for a key that is not a text, and for a path that is not Unicode: the types of records have neither.
+        let payload = serde_json::to_value(payload).unwrap_or_default();
         Self { mono_ns, actor, station, kind, cycle, command_id: None, reason: String::new(), payload }
     }
 }

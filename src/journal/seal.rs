@@ -14,15 +14,15 @@ const DOMAIN: &str = "regrind journal seal 1\n";
 
 /// Payload of a record of kind `seal`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Seal {
+pub struct Seal {
     /// Number of records before the seal.
-    pub(super) records: u64,
+    pub records: u64,
     /// Hash of the last of these records.
-    pub(super) head: String,
+    pub head: String,
     /// Public key of the signer, 64 hexadecimal digits.
-    pub(super) key: String,
+    pub key: String,
     /// Signature, 128 hexadecimal digits.
-    pub(super) signature: String,
+    pub signature: String,
 }
 
 impl Seal {

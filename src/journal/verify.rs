@@ -9,11 +9,13 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::artefact::{Artefact, describe, path_within, temporary_name};
+use super::content::{Begin, KeyField, Reopen, read_object};
 use super::error::JournalError;
 use super::key::PublicKey;
+use super::names::{ANCHOR, DATABASE, LOCK};
+use super::reader::Reader;
 use super::record::{Record, RecordKind};
 use super::seal::{Seal, is_signed};
-use super::{ANCHOR, DATABASE, LOCK, Reader};
 
 /// Length of the journal at some time, and the hash of its last record then. A copy kept elsewhere proves that no
 /// record up to this one was cut off.
@@ -340,16 +342,16 @@ impl<'a> VerifierState<'a> {
 
     fn check_key(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: String| Err(broken(self.folder, record.seq, what));
-        let value = record.value();
+        let Some(Reopen { key, .. }) = Reopen::read(record) else {
+            return wrong("it is not a JSON object".to_owned());
+        };
         if record.kind == RecordKind::Begin {
-            value["run"].as_str().unwrap_or_default().clone_into(&mut self.run);
+            self.run = Begin::<Value>::read(record).and_then(|begin| begin.run).unwrap_or_default();
         }
-        self.key = match &value["key"] {
-            Value::Null => None,
-            key => match key.as_str().and_then(|key| key.parse().ok()) {
-                Some(key) => Some(key),
-                None => return wrong("it names an invalid key".to_owned()),
-            },
+        self.key = match key {
+            None => None,
+            Some(KeyField::Key(key)) => Some(key),
+            Some(KeyField::Invalid(_)) => return wrong("it names an invalid key".to_owned()),
         };
         let no_author = match self.key {
             _ if self.trusted.is_empty() => None,
@@ -365,7 +367,7 @@ impl<'a> VerifierState<'a> {
 
     fn check_seal(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: &str| Err(broken(self.folder, record.seq, what));
-        let Ok(seal) = serde_json::from_str::<Seal>(&record.payload) else { return wrong("it is not a valid seal") };
+        let Some(seal) = read_object::<Seal>(record) else { return wrong("it is not a valid seal") };
         let Some(key) = self.key.filter(|key| key.to_string() == seal.key) else {
             return wrong("its key is not the one that the run names");
         };
@@ -429,7 +431,7 @@ impl<'a> VerifierState<'a> {
 
     fn check_artefact(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: String| Err(broken(self.folder, record.seq, what));
-        let Ok(known) = serde_json::from_str::<Artefact>(&record.payload) else {
+        let Some(known) = read_object::<Artefact>(record) else {
             return wrong("it names no file".to_owned());
         };
         let Ok(path) = path_within(self.folder, &known.name) else {
@@ -554,5 +556,53 @@ mod tests {
             seen.check_record(&record).unwrap();
         }
         assert!(bits > 190_000 && impossible < 1_000, "{bits} bits, {impossible} impossible");
+    }
+
+    #[test]
+    fn begin_and_reopen_must_be_objects() {
+        let forged = |kind, seq, head: &str, payload: &str| {
+            let mut record = Record {
+                seq,
+                utc: "2026-01-01T00:00:00.000000Z".into(),
+                boot_id: "0".repeat(16),
+                mono_ns: 0,
+                actor: "cell".into(),
+                station: "regrind".into(),
+                kind,
+                part: "SN 7".into(),
+                cycle: 0,
+                command_id: None,
+                reason: String::new(),
+                payload: payload.into(),
+                prev_hash: head.into(),
+                hash: String::new(),
+            };
+            record.hash = record.expected_hash();
+            record
+        };
+        let folder = Path::new("run");
+        for payload in ["[]", "null", "7", "\"run\"", "[\"run-1\",true,1,null,\"0.1.0\",null]"] {
+            let zeros = "0".repeat(64);
+            let begin = forged(RecordKind::Begin, 1, &zeros, payload);
+            let error = VerifierState::new(folder, &[]).check_record(&begin).unwrap_err();
+            assert!(matches!(error, JournalError::Broken { seq: 1, .. }), "{payload}: {error}");
+            let mut seen = VerifierState::new(folder, &[]);
+            let begin = forged(RecordKind::Begin, 1, &zeros, "{\"run\":\"run-1\"}");
+            seen.check_record(&begin).unwrap();
+            let error = seen.check_record(&forged(RecordKind::Reopen, 2, &begin.hash, payload)).unwrap_err();
+            assert!(matches!(error, JournalError::Broken { seq: 2, .. }), "{payload}: {error}");
+        }
+        // The fields of a file and of a seal as lists: an object is due.
+        for (kind, payload) in [
+            (RecordKind::Artefact, "[\"a\",0,\"e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855\"]"),
+            (RecordKind::Seal, "[1,\"h\",\"k\",\"s\"]"),
+        ] {
+            let mut seen = VerifierState::new(folder, &[]);
+            let begin = forged(RecordKind::Begin, 1, &"0".repeat(64), "{\"run\":\"run-1\"}");
+            seen.check_record(&begin).unwrap();
+            let error = seen.check_record(&forged(kind, 2, &begin.hash, payload)).unwrap_err();
+            let JournalError::Broken { what, .. } = error else { panic!("{error}") };
+            assert!(["it names no file", "it is not a valid seal"].contains(&&*what), "{what}");
+        }
     }
 }

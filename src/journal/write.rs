@@ -6,18 +6,23 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use rusqlite::{Connection, OptionalExtension};
-use serde_json::{Value, json};
+use serde_json::Value;
 
 use super::artefact::{self, Artefact};
-use super::canonical::canonical_json;
+use super::canonical::{canonical_json, sha256_hex};
 use super::clock::utc;
+use super::content::{Begin, End, KeyField, Reopen};
 use super::error::JournalError;
 use super::key::AuditKey;
 use super::locked_file::LockedFile;
+use super::names::{ANCHOR, DATABASE, LOCK};
 use super::record::{Entry, Record, RecordKind, Records, signed, whole};
 use super::seal::{SEALED_EVERY, Seal};
 use super::verify::{Anchor, read_anchor};
-use super::{ANCHOR, DATABASE, LOCK, open, system};
+use super::{open, system};
+
+/// Version of the program, as the records name it.
+const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// Content of the first record.
 #[derive(Clone, Debug, PartialEq)]
@@ -124,11 +129,15 @@ impl Journal {
             artefacts: BTreeMap::new(),
             files: BTreeMap::new(),
         };
-        let payload = json!({
-            "run": journal.run, "simulation": simulation, "first_command_id": first_command_id, "content": content,
-            "regrind": env!("CARGO_PKG_VERSION"), "key": journal.key.as_ref().map(AuditKey::public),
-        });
-        journal.append(Entry { actor, station, ..Entry::new(RecordKind::Begin, 0, 0, payload) })?;
+        let begin = Begin {
+            run: Some(journal.run.clone()),
+            simulation: Some(simulation),
+            first_command_id: Some(first_command_id),
+            content,
+            regrind: Some(VERSION.to_owned()),
+            key: journal.key.as_ref().map(KeyField::of),
+        };
+        journal.append(Entry { actor, station, ..Entry::new(RecordKind::Begin, 0, 0, begin) })?;
         journal.anchor()?;
         Ok(journal)
     }
@@ -182,9 +191,8 @@ impl Journal {
             _lock: lock,
         };
         journal.is_whole()?;
-        let payload =
-            json!({ "regrind": env!("CARGO_PKG_VERSION"), "key": journal.key.as_ref().map(AuditKey::public) });
-        journal.append(Entry::new(RecordKind::Reopen, 0, journal.tail.cycle, payload))?;
+        let reopen = Reopen { regrind: Some(VERSION.to_owned()), key: journal.key.as_ref().map(KeyField::of) };
+        journal.append(Entry::new(RecordKind::Reopen, 0, journal.tail.cycle, reopen))?;
         journal.anchor()?;
         Ok(journal)
     }
@@ -289,7 +297,7 @@ impl Journal {
     /// is full or not writable.
     pub fn store(&mut self, name: &str, bytes: &[u8], mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
         let path = artefact::path_within(&self.folder, name)?;
-        let sha256 = super::sha256_hex(bytes);
+        let sha256 = sha256_hex(bytes);
         if self.artefacts.get(name).is_some_and(|known| *known != sha256) {
             return Err(JournalError::Recorded { path });
         }
@@ -353,8 +361,8 @@ impl Journal {
     pub fn end(&mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError> {
         self.reread_tail()?;
         if !self.tail.closed {
-            let payload = json!({ "ending": ending, "records_before": self.tail.seq, "head_before": self.tail.hash });
-            self.append(Entry::new(RecordKind::End, mono_ns, cycle, payload))?;
+            let end = End { ending, records_before: Some(self.tail.seq), head_before: Some(self.tail.hash.clone()) };
+            self.append(Entry::new(RecordKind::End, mono_ns, cycle, end))?;
         }
         let anchor = self.anchor()?;
         // The run is complete: from now on, closing the database writes the log into it.
@@ -364,8 +372,7 @@ impl Journal {
 
     fn register(&mut self, artefact: Artefact, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
         if !self.artefacts.contains_key(&artefact.name) {
-            let payload = json!({ "name": artefact.name, "bytes": artefact.bytes, "sha256": artefact.sha256 });
-            self.append(Entry::new(RecordKind::Artefact, mono_ns, cycle, payload))?;
+            self.append(Entry::new(RecordKind::Artefact, mono_ns, cycle, &artefact))?;
             self.artefacts.insert(artefact.name.clone(), artefact.sha256.clone());
         }
         Ok(artefact)
@@ -376,7 +383,7 @@ impl Journal {
     fn seal(&mut self) -> Result<(), JournalError> {
         let Some(key) = self.key.as_ref().filter(|_| self.tail.seq > self.sealed()) else { return Ok(()) };
         let seal = Seal::new(key, &self.run, self.tail.seq, &self.tail.hash);
-        self.put(Entry::new(RecordKind::Seal, self.tail.mono_ns, self.tail.cycle, json!(seal)))?;
+        self.put(Entry::new(RecordKind::Seal, self.tail.mono_ns, self.tail.cycle, &seal))?;
         self.seal = Some(seal);
         Ok(())
     }
@@ -396,7 +403,7 @@ impl Journal {
             Some(seal) => Anchor::sealed(&self.run, seal),
             None => Anchor::new(self.tail.seq, self.tail.hash.clone()),
         };
-        let mut text = canonical_json(&json!(anchor));
+        let mut text = canonical_json(&serde_json::to_value(&anchor).unwrap_or_default());
         text.push('\n');
         artefact::write_file(&self.folder.join(ANCHOR), text.as_bytes())?;
         self.anchored = self.tail.seq;
@@ -571,10 +578,10 @@ fn first_of(connection: &Connection, folder: &Path) -> Result<(String, String, u
     if first.kind != RecordKind::Begin {
         return Err(broken("it is not the beginning of a run"));
     }
-    let value = first.value();
-    let id = value["first_command_id"].as_u64().and_then(|id| u32::try_from(id).ok());
-    let run = value["run"].as_str().ok_or_else(|| broken("it names no run"))?;
-    Ok((run.to_owned(), first.part, id.ok_or_else(|| broken("it names no first command number"))?))
+    let begin = Begin::<Value>::read(&first).ok_or_else(|| broken("it is not a JSON object"))?;
+    let run = begin.run.ok_or_else(|| broken("it names no run"))?;
+    let id = begin.first_command_id.ok_or_else(|| broken("it names no first command number"))?;
+    Ok((run, first.part, id))
 }
 
 fn artefacts_of(connection: &Connection, folder: &Path) -> Result<BTreeMap<String, String>, JournalError> {
