@@ -29,6 +29,7 @@ pub use regrind_device as device;
 pub use regrind_document as document;
 pub use regrind_formats as formats;
 pub use regrind_journal as journal;
+pub use regrind_record as record;
 pub use regrind_report as report;
 
 pub mod config;

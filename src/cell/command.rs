@@ -139,9 +139,18 @@ impl Command {
         format_label(self.label())
     }
 
+    /// Returns true if an event is expected as the answer to the command. A command without an answer (such as an alarm)
+    /// is complete when it is issued.
+    pub fn expects_answer(&self) -> bool {
+        !matches!(
+            self,
+            Self::Announce(_) | Self::Raise(_) | Self::Withdraw { .. } | Self::Refuse { .. } | Self::Finish(_)
+        )
+    }
+
     /// Returns the name of the kind of command, such as "prepare", and the machine that the command contains. The
     /// machine is `None` if the command contains none. [`Self::name`] joins name and machine into one text.
-    pub(super) fn label(&self) -> (&'static str, Option<Device>) {
+    pub fn label(&self) -> (&'static str, Option<Device>) {
         let (name, device) = match self {
             Self::Connect { device } => ("connect", Some(device)),
             Self::AskToLoad => ("ask_to_load", None),

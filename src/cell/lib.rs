@@ -22,6 +22,7 @@
 mod alarm;
 mod cell;
 mod command;
+mod cycle_row;
 mod event;
 mod interval;
 mod judge;
@@ -35,6 +36,7 @@ mod transitions;
 pub use alarm::{Alarm, AlarmId, Role};
 pub use cell::Cell;
 pub use command::{Command, Ending, Judgement, Verdict};
+pub use cycle_row::CycleRow;
 pub use event::{
     Actor, CompensationRefusal, CompensationSummary, Condition, ConnectionRefusal, Event, Figures, Forecast,
     FurtherTouches, GateFailure, GateResult, JobResult, MachineRequest, Occupation, OutlierFigures, PartResponse,

@@ -7,8 +7,9 @@ use clap::{Args, Subcommand, ValueEnum};
 use regrind::journal::{
     Anchor, DATABASE, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Verified, verify_against,
 };
+use regrind::record::{Begin, RunContent, begin_of};
 use regrind::report::{RUN_REPORT, run_report, words};
-use serde_json::{Value, json};
+use serde_json::json;
 
 use super::Outcome;
 use super::control::{folder_of, folders};
@@ -176,7 +177,7 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
         },
     };
     #[cfg(not(feature = "plant"))]
-    let copy: Option<Value> = None;
+    let copy: Option<serde_json::Value> = None;
     let folder = folder_of(arguments.run.as_deref())?;
     if is_folder_of_runs(&folder) {
         if let Some(anchor) = &arguments.anchor {
@@ -196,10 +197,10 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
         super::print_json(&json!({ "run": folder, "sound": false, "record": record, "what": what }))?;
     }
     let verified = found.map_err(failure)?;
-    let begin = first(&folder)?;
+    let begin = begin_of(&folder).map_err(failure)?;
     if arguments.json {
         let mut told = json!({
-            "run": folder, "simulation": begin["simulation"], "sound": true, "records": verified.records,
+            "run": folder, "simulation": begin.simulation, "sound": true, "records": verified.records,
             "head": verified.head, "anchored": verified.anchored, "closed": verified.closed,
             "under_way": verified.under_way, "artefacts": verified.artefacts, "unrecorded": verified.unrecorded,
             "keys": verified.keys, "seals": verified.seals, "signed": verified.signed,
@@ -277,14 +278,8 @@ fn read_anchor(path: &Path) -> Result<Anchor, Failure> {
     serde_json::from_slice(&bytes).map_err(|error| wrong(format!("not an anchor: {error}")))
 }
 
-fn first(folder: &Path) -> Result<Value, Failure> {
-    let reader = Reader::open(folder).map_err(failure)?;
-    let first = reader.records(0).next().transpose().map_err(failure)?;
-    Ok(first.map_or(Value::Null, |record| record.value()))
-}
-
-fn mark(begin: &Value) -> &'static str {
-    if begin["simulation"] == true { "SIMULATION  " } else { "" }
+fn mark(begin: &Begin<RunContent>) -> &'static str {
+    if begin.simulation == Some(true) { "SIMULATION  " } else { "" }
 }
 
 /// Returns the text about the signatures of a verified journal: the number of the last signed record, or that all
@@ -307,7 +302,7 @@ fn signed(verified: &Verified, as_given: bool) -> String {
     format!("{reach}, by {}{then}{given}", named(first))
 }
 
-fn sound(folder: &Path, begin: &Value, verified: &Verified, as_given: bool) -> String {
+fn sound(folder: &Path, begin: &Begin<RunContent>, verified: &Verified, as_given: bool) -> String {
     let Verified { records, head, anchored, closed, artefacts, unrecorded, .. } = verified;
     let records = super::words::counted(*records as usize, "record");
     let files = super::words::counted(*artefacts as usize, "file");
@@ -341,8 +336,9 @@ fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
     if arguments.json {
         return print_lines(folder, None, wanted, Record::json_line);
     }
-    let begin = first(&folder)?;
-    let part = begin["content"]["part_name"].as_str().map_or(String::new(), |name| format!("; {name}"));
+    let begin = begin_of(&folder).map_err(failure)?;
+    let [part, ..] = begin.content.names();
+    let part = part.map_or(String::new(), |name| format!("; {name}"));
     let head = format!(
         "{}{}{part}\n{:>6}  {:<19}  {:<16}  {:<8}  {:>5}  what",
         mark(&begin),

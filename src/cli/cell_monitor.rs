@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use jiff::Timestamp;
 use regrind::drive::Request;
 use regrind::journal::{DATABASE, Reader, Stamp, is_driven, stamp};
+use regrind::record::{Begin, RunContent};
 use regrind::report::{RunResult, RunSummary, run_summary};
 use regrind_live::{CellStatus, EndedRun, RunStatus};
 
@@ -158,7 +159,8 @@ impl CellMonitor {
         let reader = Reader::open(run).ok()?;
         let first = reader.records(0).next()?.ok()?;
         let last = reader.last().ok()??.utc.parse().ok()?;
-        let last = (first.value()["content"]["recover"] != true).then_some(last);
+        let is_recovery = Begin::<RunContent>::read(&first).is_some_and(|begin| begin.content.is_recovery());
+        let last = (!is_recovery).then_some(last);
         self.known.insert(run.to_owned(), (at, last));
         last
     }

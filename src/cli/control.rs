@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use regrind::cell::Device;
 use regrind::drive::{CycleRow, JobProgress, Reply, Request, Snapshot, is_live, send_request};
-use regrind::journal::{MachineLock, Reader, RecordKind};
+use regrind::journal::{MachineLock, Reader, Record, RecordKind};
+use regrind::record::{Begin, RunContent};
 use regrind_control::{is_live_at, send_request_at};
 
 use super::Outcome;
@@ -298,8 +299,8 @@ pub(super) fn unfinished(runs: &Path) -> Option<PathBuf> {
     let is_open = |folder: &PathBuf| {
         let Ok(reader) = Reader::open(folder) else { return false };
         let mut records = reader.records(0).filter_map(Result::ok);
-        let is_run = records.next().is_some_and(|first| first.value()["content"]["recover"] != true);
-        is_run && !records.any(|record| record.kind == RecordKind::End)
+        let is_run = |first: &Record| Begin::<RunContent>::read(first).is_none_or(|begin| !begin.content.is_recovery());
+        records.next().as_ref().is_some_and(is_run) && !records.any(|record| record.kind == RecordKind::End)
     };
     let mut all: Vec<_> = folders(runs).collect();
     all.sort_by_cached_key(|folder| began(folder));

@@ -10,8 +10,8 @@ use regrind::config::{CellConfig, LinkConfig};
 use regrind::device::{Machine, MachineKind, MachineState, ModbusCmm, ModbusGrinder, ModbusSettings};
 use regrind::drive::recovery::{self, RecoveryError, RecoveryStep, describe_status, read_status};
 use regrind::journal::{Header, Journal, MachineLock, Reader, RecordKind};
+use regrind::record::{Begin, RecoveryEnd, RecoveryStart, RunContent, RunEnd};
 use regrind::setup;
-use serde_json::json;
 
 use super::failure::Failure;
 use super::live::{lock_machine, owner};
@@ -55,9 +55,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let epoch = MachineLock::epoch(taken.iter().flatten(), epoch(began));
     let settings = |link| setup::modbus_settings(link, cell.simulated, owner(&actor, &folder), epoch);
     let [cmm, grinder] = [settings(&cell.cmm.link), settings(&cell.grinder.link)];
-    let mut content = json!({ "recover": true, "cell": cell.path() });
-    let (place, turn) = RunPlace::next(&arguments.runs)?;
-    place.in_record(&mut content);
+    let (RunPlace { number, before }, turn) = RunPlace::next(&arguments.runs)?;
+    let named = cell.path().to_string_lossy().into_owned();
+    let content =
+        RunContent::Recovery(RecoveryStart { recover: true, cell: Some(named), number: Some(number), before });
     let header = Header {
         run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
         part: "unnamed".into(),
@@ -65,7 +66,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         station: actor.station.clone(),
         simulation: cell.simulated,
         first_command_id: 1,
-        content,
+        content: content.into(),
     };
     let journal = Journal::create_with(&folder, header, key::of_this_user()?).map_err(Failure::Journal)?;
     drop(turn);
@@ -173,9 +174,9 @@ impl Recovery {
     fn run_of(&self, job: u32) -> Option<String> {
         let is_open = |folder: &PathBuf| -> Option<bool> {
             let reader = Reader::open(folder).ok()?;
-            let begin = reader.records(0).next()?.ok()?.value();
+            let begin = Begin::<RunContent>::read(&reader.records(0).next()?.ok()?)?;
             let ended = reader.records(0).any(|record| record.is_ok_and(|record| record.kind == RecordKind::End));
-            Some(begin["content"]["job"] == job && !ended)
+            Some(begin.content.part()?.job == Some(job) && !ended)
         };
         // The record of this recovery is open for writing. Reading it here as well would release its lock.
         let others = control::folders(&self.runs).filter(|folder| *folder != self.folder);
@@ -184,8 +185,8 @@ impl Recovery {
     }
 
     fn end(self, home: [bool; 2]) -> Result<Outcome, Failure> {
-        let idle = json!({ "cmm_home": home[0], "grinder_home": home[1] });
-        self.journal.close(0, 0, idle).map_err(Failure::Journal)?;
+        let idle = RunEnd::Recovery(RecoveryEnd { cmm_home: home[0], grinder_home: home[1] });
+        self.journal.close(0, 0, idle.into()).map_err(Failure::Journal)?;
         super::print(&format!("record in {}\n", self.folder.display()))?;
         if home == [true, true] { Ok(Outcome::Accepted) } else { Err(Failure::NotHome) }
     }

@@ -11,13 +11,11 @@ use regrind::config::CellConfig;
 use regrind::drive::{InterruptedRun, Request, Task};
 use regrind::formats::{FormatError, Learned};
 use regrind::journal::{
-    Artefact, DATABASE, Entry, Journal, JournalError, LOCK, Reader, RecordKind, RunLock, may_be_lost, newest_cycle,
-    verify,
+    Artefact, DATABASE, Journal, JournalError, LOCK, Reader, RecordKind, RunLock, may_be_lost, newest_cycle, verify,
 };
 use regrind::recipe::Recipe;
+use regrind::record::{Begin, Content, PartStart, RecordedPlan, Remark, RunContent};
 use regrind::setup;
-use serde::Deserialize;
-use serde_json::{Value, json};
 
 use super::failure::Failure;
 use super::live::{PreparedRun, RunContext, outcome};
@@ -110,10 +108,9 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
         let mut journal = Journal::open_locked(lock, key).map_err(Failure::Journal)?;
         if let Some(what) = &begun.lost {
             let remark = format!("resumed with --despite-loss, although the end of the record may be lost: {what}");
-            let Actor { name: actor, station } = live.actor.clone();
-            let note = Entry::new(RecordKind::Note, 0, begun.cycle, json!({ "remark": remark }));
-            let entry = Entry { actor, station, ..note };
-            journal.append(entry).map_err(Failure::Journal)?;
+            let Actor { name, station } = live.actor.clone();
+            let remark = Content::Remark(Remark { remark });
+            journal.append(remark.entry(0, begun.cycle, (name, station))).map_err(Failure::Journal)?;
         }
         let (loaded, interrupted) = (cell.simulated, Some(interrupted));
         outcome(&live.carry_out(machines, PreparedRun { task, plan, journal, loaded, interrupted }).await?)
@@ -126,8 +123,7 @@ fn is_bare(run: &Path) -> bool {
     names.all(|name| name.to_str().is_some_and(|name| name.starts_with(DATABASE) || name == LOCK))
 }
 
-/// Content of the first record of a run that is required to resume the run.
-#[derive(Deserialize)]
+/// Inputs with which an interrupted run began, as its record has them.
 struct RunStart {
     recipe: PathBuf,
     cell: PathBuf,
@@ -138,18 +134,13 @@ struct RunStart {
     part_in_files: String,
     job: u32,
     seed: Option<u64>,
-    plan: Value,
-    table_version: u32,
-    #[serde(default)]
+    plan: RecordedPlan,
     rehearsal: bool,
     /// Reason why records may be lost, if a person continues with `--despite-loss`.
-    #[serde(skip)]
     lost: Option<String>,
     /// Highest cycle number in the record.
-    #[serde(skip)]
     cycle: u32,
     /// The files that are on record, by their names: nothing else of the folder is read.
-    #[serde(skip)]
     files: BTreeMap<String, Artefact>,
 }
 
@@ -189,31 +180,48 @@ impl RunStart {
         if !records().any(|record| record.kind == RecordKind::Event) {
             return Err(Failure::NotBegun { run: run.to_owned() });
         }
-        let first = records().next().map(|record| record.value());
-        let content = first.as_ref().map_or(Value::Null, |first| first["content"].clone());
-        let program = first.as_ref().and_then(|first| first["regrind"].as_str()).unwrap_or("unknown").to_owned();
-        let mut begun: Self = serde_json::from_value(content).map_err(|error| Failure::EarlierRun {
-            run: run.to_owned(),
-            program: program.clone(),
-            what: error.to_string(),
-        })?;
-        if begun.table_version != TABLE_VERSION {
-            let what = format!(
-                "the run uses version {} of the transition table, but this program uses version {TABLE_VERSION}",
-                begun.table_version
-            );
-            return Err(Failure::EarlierRun { run: run.to_owned(), program, what });
-        }
+        let begin = records().next().and_then(|first| Begin::<RunContent>::read(&first)).unwrap_or_default();
+        let program = begin.regrind.unwrap_or_else(|| "unknown".to_owned());
+        let earlier = |what: String| Failure::EarlierRun { run: run.to_owned(), program: program.clone(), what };
+        let start = begin.content.part().cloned().unwrap_or_default();
+        let mut begun = Self::from_record(start).map_err(earlier)?;
         for record in records().filter(|record| record.kind == RecordKind::Artefact) {
-            let file: Artefact = serde_json::from_value(record.value()).map_err(|error| Failure::EarlierRun {
-                run: run.to_owned(),
-                program: program.clone(),
-                what: error.to_string(),
-            })?;
+            let Content::Artefact(file) = Content::read(&record).map_err(|error| earlier(error.to_string()))? else {
+                continue;
+            };
             begun.files.insert(file.name.clone(), file);
         }
         (begun.lost, begun.cycle) = (lost, last);
         Ok(begun)
+    }
+
+    /// Takes the inputs that this program needs from `start`, the first record of a run. Returns a message about the
+    /// first input that is missing, or about another version of the transition table.
+    fn from_record(start: PartStart) -> Result<Self, String> {
+        fn due<T>(input: Option<T>, name: &str) -> Result<T, String> {
+            input.ok_or_else(|| format!("missing field `{name}`"))
+        }
+        let begun = Self {
+            recipe: due(start.recipe, "recipe")?.into(),
+            cell: due(start.cell, "cell")?.into(),
+            working_folder: due(start.working_folder, "working_folder")?.into(),
+            nominal_sha256: due(start.nominal_sha256, "nominal_sha256")?,
+            setting: due(start.setting, "setting")?,
+            part_in_files: due(start.part_in_files, "part_in_files")?,
+            job: due(start.job, "job")?,
+            seed: start.seed,
+            plan: due(Some(start.plan).filter(|plan| !plan.is_missing()), "plan")?,
+            rehearsal: start.rehearsal.unwrap_or_default(),
+            lost: None,
+            cycle: 0,
+            files: BTreeMap::new(),
+        };
+        match due(start.table_version, "table_version")? {
+            TABLE_VERSION => Ok(begun),
+            version => Err(format!(
+                "the run uses version {version} of the transition table, but this program uses version {TABLE_VERSION}"
+            )),
+        }
     }
 
     /// Returns the text of the input file `name` (recipe or cell file) that the run `run` stored when it began. Returns
@@ -253,7 +261,7 @@ impl RunStart {
         if task.setting != self.setting {
             return differs("the setting of grinding, measuring and correction");
         }
-        if serde_json::to_value(&plan).ok().as_ref() != Some(&self.plan) {
+        if RecordedPlan::new(&plan) != self.plan {
             return differs("the plan of the cell");
         }
         Ok((task, plan))

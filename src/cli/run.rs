@@ -13,8 +13,8 @@ use regrind::drive::Task;
 use regrind::formats::{KnowledgeOrigin, LEARNED, Learned, LearnedError};
 use regrind::journal::{AuditKey, Header, Journal, free_bytes, utc_to_the_second};
 use regrind::recipe::Recipe;
+use regrind::record::{PartStart, RecordedPlan, RunContent};
 use regrind::setup;
-use serde_json::json;
 
 use super::failure::Failure;
 use super::live::{PreparedRun, RunContext, outcome};
@@ -179,9 +179,8 @@ async fn carry_out(
             "not signed: the origin of this record cannot be proven; create a signing key with `regrind audit key`\n",
         )?;
     }
-    let mut header = header(arguments, &live, (&task, &plan), earlier.as_ref());
     let (place, turn) = RunPlace::next(&arguments.runs)?;
-    place.in_record(&mut header.content);
+    let header = header(arguments, &live, (&task, &plan), earlier.as_ref(), place);
     let mut journal = begin(header, &live, earlier.and_then(|earlier| earlier.learned), key)?;
     drop(turn);
     let works_by_program = cell.grinder.link.wire.reads_run_folder() || cell.grinder.program.folder.is_some();
@@ -329,18 +328,18 @@ pub(super) fn within(cell: &CellConfig) -> bool {
 
 /// Returns the first entry of the record of a run. The entry contains the data that a program needs to resume the run,
 /// such as the paths and hashes of the recipe and the cell file, and the plan. `live` is the context of the run.
-/// `earlier` is the knowledge from earlier runs with which the run begins; `None` if there is none.
+/// `earlier` is the knowledge from earlier runs with which the run begins; `None` if there is none. `place` is the
+/// position of the run among the runs of its folder.
 fn header(
     arguments: &Arguments,
     live: &RunContext,
     (task, plan): (&Task, &CellPlan),
     earlier: Option<&EarlierKnowledge>,
+    place: RunPlace,
 ) -> Header {
     let RunContext { recipe, cell, folder, actor, .. } = live;
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
-    let learned_from = earlier.and_then(|earlier| earlier.learned.as_ref()).map(|(learned, _)| &learned.run);
-    let taught_by =
-        earlier.and_then(|earlier| earlier.learned.as_ref()).and_then(|(learned, _)| learned.origin.as_ref());
+    let learned = earlier.and_then(|earlier| earlier.learned.as_ref()).map(|(learned, _)| learned);
     let left_alone = earlier.iter().flat_map(|earlier| &earlier.skipped).map(ToString::to_string);
     let left_alone: Vec<String> =
         left_alone.chain(earlier.iter().flat_map(|earlier| earlier.messages.clone())).collect();
@@ -353,15 +352,29 @@ fn header(
         station: actor.station.clone(),
         simulation: cell.is_marked_simulation(),
         first_command_id: 1,
-        content: json!({
-            "recipe": recipe.path(), "recipe_sha256": hex(recipe.source_sha256()),
-            "cell": cell.path(), "cell_sha256": hex(cell.source_sha256()),
-            "working_folder": std::env::current_dir().unwrap_or_default().to_string_lossy(),
-            "nominal_sha256": hex(&task.part_identity), "setting": task.setting,
-            "part_name": recipe.part.name, "part_in_files": live.part, "job": live.job, "seed": arguments.seed,
-            "plan": plan, "table_version": TABLE_VERSION, "machines_within": machines_within, "rehearsal": cell.rehearsal,
-            "learned_from": learned_from, "taught_by": taught_by, "left_alone": left_alone,
-        }),
+        content: RunContent::Part(Box::new(PartStart {
+            recipe: Some(recipe.path().to_string_lossy().into_owned()),
+            recipe_sha256: Some(hex(recipe.source_sha256())),
+            cell: Some(cell.path().to_string_lossy().into_owned()),
+            cell_sha256: Some(hex(cell.source_sha256())),
+            working_folder: Some(std::env::current_dir().unwrap_or_default().to_string_lossy().into_owned()),
+            nominal_sha256: Some(hex(&task.part_identity)),
+            setting: Some(task.setting.clone()),
+            part_name: Some(recipe.part.name.clone()),
+            part_in_files: Some(live.part.to_owned()),
+            job: Some(live.job),
+            seed: arguments.seed,
+            plan: RecordedPlan::new(plan),
+            table_version: Some(TABLE_VERSION),
+            machines_within: Some(machines_within),
+            rehearsal: Some(cell.rehearsal),
+            learned_from: learned.map(|learned| learned.run.clone()),
+            taught_by: learned.and_then(|learned| learned.origin.clone()),
+            left_alone: Some(left_alone),
+            number: Some(place.number),
+            before: place.before,
+        }))
+        .into(),
     }
 }
 

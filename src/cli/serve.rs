@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use clap::Args;
 use regrind::config::CellConfig;
-use regrind::journal::Reader;
 use regrind::recipe::Recipe;
+use regrind::record::begin_of;
 use regrind::setup;
 use regrind_page::{Entrance, Page, Tls, UsersFile};
 use tokio::net::TcpListener;
@@ -164,13 +164,12 @@ impl PlannedPointsCache {
 /// points again from the recipe and the cell file in this folder. Returns `None` if the recipe, the cell file or the
 /// first record is missing or invalid.
 fn planned(run: &Path) -> Option<Vec<[f64; 2]>> {
-    let first = Reader::open(run).ok()?.records(0).next()?.ok()?.value();
-    let content = &first["content"];
-    let from = PathBuf::from(content["working_folder"].as_str()?);
-    let named = |key: &str| Some(from.join(content[key].as_str()?));
+    let begin = begin_of(run).ok()?;
+    let start = begin.content.part()?;
+    let from = PathBuf::from(start.working_folder.as_ref()?);
     let text = |name: &str| std::fs::read_to_string(run.join(name)).ok();
-    let recipe = Recipe::parse(&named("recipe")?, &text("recipe.toml")?).ok()?;
-    let cell = CellConfig::parse(&named("cell")?, &text("cell.toml")?).ok()?;
+    let recipe = Recipe::parse(&from.join(start.recipe.as_ref()?), &text("recipe.toml")?).ok()?;
+    let cell = CellConfig::parse(&from.join(start.cell.as_ref()?), &text("cell.toml")?).ok()?;
     let (task, _) = setup::prepare(&recipe, &cell).ok()?;
     Some(task.targets.iter().map(|target| [target.point.x, target.point.y]).collect())
 }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use regrind::formats::ResultFolder;
 use regrind::journal::{Anchor, ExternalEvidence, JournalError, PublicKey, Reader, anchor_of, verify_against};
-use serde::{Deserialize, Serialize};
+use regrind::record::{PreviousRun, begin_of};
 use serde_json::{Value, json};
 
 use super::Outcome;
@@ -25,21 +25,13 @@ const TURN_COMES_WITHIN: Duration = Duration::from_secs(5);
 const ASKED_EVERY: Duration = Duration::from_millis(20);
 
 /// Position of a run in the sequence of the runs of a folder.
-#[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Default, PartialEq)]
 pub(super) struct RunPlace {
     /// Number of the run, from 1.
-    number: u64,
+    pub(super) number: u64,
     /// State of the previous run when this run began; `None` if there was no previous run, or if its anchor could not
     /// be read.
-    before: Option<Before>,
-}
-
-/// State of a run at the time when the next run begins.
-#[derive(Debug, PartialEq, Serialize, Deserialize)]
-struct Before {
-    run: String,
-    records: u64,
-    head: String,
+    pub(super) before: Option<PreviousRun>,
 }
 
 /// Lock that keeps other runs from beginning in a folder until it is dropped, so that two simultaneous runs receive
@@ -67,24 +59,19 @@ impl RunPlace {
         let last = newest_with_numbers(runs).into_iter().max_by_key(|(number, _)| *number);
         let before = last.as_ref().and_then(|(_, folder)| {
             let Anchor { records, head, .. } = anchor_of(folder).ok()??;
-            Some(Before { run: name_of(folder), records, head })
+            Some(PreviousRun { run: name_of(folder), records, head })
         });
         let number = last.map_or(0, |(number, _)| number).saturating_add(1);
         Ok((Self { number, before }, SuccessionLock(folder)))
-    }
-
-    /// Adds the number of the run, and its previous run, to `content`, the content of the first record of a run.
-    pub(super) fn in_record(&self, content: &mut Value) {
-        content["number"] = json!(self.number);
-        content["before"] = json!(self.before);
     }
 
     /// Reads the place of the run in `folder` from its first record: the number of the run, and the state of its
     /// previous run. Returns `None` if the record cannot be read or has no number, as in runs of early versions of the
     /// program.
     fn read(folder: &Path) -> Option<Self> {
-        let first = Reader::open(folder).ok()?.records(0).next()?.ok()?;
-        serde_json::from_value(first.value()["content"].clone()).ok()
+        let begin = begin_of(folder).ok()?;
+        let (number, before) = begin.content.place()?;
+        Some(Self { number, before: before.cloned() })
     }
 }
 
@@ -212,9 +199,7 @@ impl Proof {
                 format!("sound, {} records{}", found.records, if found.keys.is_empty() { ", not signed" } else { "" })
             }
         };
-        let begun_as = Reader::open(folder)
-            .ok()
-            .and_then(|reader| Some(reader.records(0).next()?.ok()?.value()["run"].as_str()?.to_owned()));
+        let begun_as = begin_of(folder).ok().and_then(|begin| begin.run);
         if let Some(begun_as) = begun_as.filter(|begun_as| *begun_as != name) {
             self.flaws.push(format!("{name}: the run began with the name {begun_as}: its folder was renamed"));
         }
@@ -233,7 +218,7 @@ impl Proof {
     ///
     /// - The name of `last` must be the stored name.
     /// - The stored number of records is the number of a record in `last`. This record must have the stored hash.
-    fn follows(&mut self, (number, folder): (u64, &Path), before: Option<&Before>, last: Option<(u64, &Path)>) {
+    fn follows(&mut self, (number, folder): (u64, &Path), before: Option<&PreviousRun>, last: Option<(u64, &Path)>) {
         let name = name_of(folder);
         let due = last.map_or(1, |(last, _)| last.saturating_add(1));
         if number > due {
@@ -249,7 +234,7 @@ impl Proof {
         } else if number < due {
             self.flaws.push(format!("{name}: another run has the same number {number}"));
         }
-        let Some(Before { run, records, head }) = before else { return };
+        let Some(PreviousRun { run, records, head }) = before else { return };
         let Some((_, last)) = last.filter(|_| number == due) else { return };
         let last_name = name_of(last);
         if last_name != *run {

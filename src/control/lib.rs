@@ -14,8 +14,10 @@ mod request;
 mod snapshot;
 mod socket;
 
+pub use regrind_cell::CycleRow;
+
 pub use request::{OnBehalf, Reply, Request};
-pub use snapshot::{CycleRow, JobProgress, NextStep, PartVerdict, PreviewStatistics, Snapshot};
+pub use snapshot::{JobProgress, NextStep, PartVerdict, PreviewStatistics, Snapshot};
 pub use socket::{
     Control, EndpointChange, ReceivedOrder, StatusStream, is_live, is_live_at, send_request, send_request_at,
     send_request_on_behalf, watch,

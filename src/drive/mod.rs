@@ -56,7 +56,11 @@ use crate::device::{
     PassRecord, PreliminaryPoints, hex,
 };
 use crate::formats::{LEARNED, write_json_atomic};
-use crate::journal::{self, Artefact, Entry, RecordKind};
+use crate::journal::{self, Artefact};
+use crate::record::{
+    self, CommandRecord, Confirmation, Content, EventDetail, EventRecord, PartEnd, Remark, RunEnd, StartIntent,
+    TouchCounts, Transfer, TransferNote,
+};
 pub use blocking_executor::{BlockingExecutor, BlockingWork};
 use computation::{Computation, batch_folder, create_folder, cycle_folder};
 use cycles::Cycles;
@@ -66,7 +70,7 @@ use preview::PreviewAccumulator;
 pub use program::{ProgramError, Programs};
 use progress_estimator::ProgressEstimator;
 pub use recorder::JournalSink;
-use recorder::{OutputFiles, RecordReceipt, Recorder, entry};
+use recorder::{OutputFiles, RecordReceipt, Recorder, nanoseconds};
 pub use replay::{InterruptedRun, ReplayError};
 use station::{
     AbortCounter, CmmDriver, FetchedResult, GrinderDriver, LoopWatchdog, MachineNotes, MachinePayload, MachineTask,
@@ -176,7 +180,8 @@ pub struct Drive {
     state_changes: u64,
     /// Number of attempts of each computation of each cycle.
     attempts: BTreeMap<(u32, Computation), u32>,
-    armed: [Option<Value>; 2],
+    /// Last preparation of each machine: CMM, grinder.
+    armed: [Option<StartIntent>; 2],
     /// Commands without an answering event so far, by the numbers of the recorder.
     open_commands: Vec<(u64, Command)>,
     /// Entries that wait to be recorded, in order.
@@ -454,7 +459,7 @@ impl Drive {
         }
         match command {
             Command::StartMachine { .. } => self.report_start_not_sent(command).await,
-            command if outcome::expects_answer(&command) => {
+            command if command.expects_answer() => {
                 drop(self.handle_event(Event::NotOnRecord { command: command.name() }, None).await);
             }
             _ => {}
@@ -481,8 +486,7 @@ impl Drive {
         if self.record_failure_reason.is_none() || self.ending.is_some() {
             return;
         }
-        let leads_on =
-            |then: &RecordAction| matches!(then, RecordAction::Execute(command) if outcome::expects_answer(command));
+        let leads_on = |then: &RecordAction| matches!(then, RecordAction::Execute(command) if command.expects_answer());
         let waiting = self.backlog.iter_mut().filter(|waiting| leads_on(&waiting.action));
         let withdrawn: Vec<RecordAction> =
             waiting.map(|waiting| std::mem::replace(&mut waiting.action, RecordAction::Nothing)).collect();
@@ -525,11 +529,13 @@ impl Drive {
             }
         }
         let rows: Vec<CycleRow> = self.cycles.rows(&self.cell.plan().tolerance);
-        let mut result = json!({ "simulation": self.task.simulation, "ending": ending, "cycles": rows });
         let touches = self.task.adaptive.map(|_| self.cycles.touch_counts(&self.task));
-        if let Some([taken, whole_patterns]) = touches {
-            result["touches"] = json!({ "taken": taken, "whole_patterns": whole_patterns });
-        }
+        let result = Value::from(RunEnd::Part(PartEnd {
+            simulation: self.task.simulation,
+            ending: ending.clone(),
+            cycles: rows.clone(),
+            touches: touches.map(|[taken, whole_patterns]| TouchCounts { taken, whole_patterns }),
+        }));
         let now = self.now();
         self.write_document("result.json".into(), self.cell.cycle(), &result).await;
         self.save_learned(&ending).await;
@@ -594,9 +600,7 @@ impl Drive {
     /// Records the text `what` of a [`Request::Remark`]. Answers the program that sent the request through `answer`,
     /// after the text is recorded.
     fn record_remark(&mut self, what: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
-        let origin = (actor.name.clone(), actor.station.clone());
-        let payload = json!({ "remark": what });
-        let ticket = self.recorder.append(entry(RecordKind::Note, self.now(), self.cell.cycle(), origin, payload));
+        let ticket = self.append(self.now(), origin(actor), &Content::Remark(Remark { remark: what.to_owned() }));
         if let Some(answer) = answer {
             let then = RecordAction::Answer { answer, accepted: true, message: "recorded".into() };
             self.backlog.push_back(PendingRecord { receipt: ticket, action: then });
@@ -608,14 +612,9 @@ impl Drive {
     /// driver of this machine. Sends the result through `answer`, if there is one. The reply is a refusal if the
     /// confirmation does not fit the run, cannot be recorded, or is refused by the driver.
     fn handle_confirmation(&mut self, request: &Request, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
-        let asked = self.operator_confirmation(request).map(|(device, confirmed, word)| {
-            let mut payload = serde_json::to_value(request).unwrap_or_default();
-            if let Some(payload) = payload.as_object_mut() {
-                payload.remove("order");
-                payload.extend([("confirmed".to_owned(), json!(confirmed)), ("device".to_owned(), json!(device))]);
-            }
-            let origin = (actor.name.clone(), actor.station.clone());
-            let ticket = self.recorder.append(entry(RecordKind::Note, self.now(), self.cell.cycle(), origin, payload));
+        let asked = self.operator_confirmation(request).map(|(confirmed, word)| {
+            let (device, ..) = confirmed.parts();
+            let ticket = self.append(self.now(), origin(actor), &Content::Confirmation(confirmed));
             let (told, taken) = oneshot::channel();
             self.backlog.push_back(PendingRecord {
                 receipt: ticket,
@@ -639,7 +638,7 @@ impl Drive {
     }
 
     /// Converts the confirmation of a person (started, done, or at rest) into a confirmation for the driver of a
-    /// machine. Returns the machine, the name of the confirmation for the record, and the confirmation.
+    /// machine. Returns the confirmation for the record, and the confirmation for the driver.
     ///
     /// # Errors
     /// Returns a message for the person:
@@ -648,21 +647,26 @@ impl Drive {
     ///   the SHA-256 of the correction map.
     /// - For "at rest": the person names no machine, and no job is in progress.
     /// - For every other request: it is not a confirmation.
-    fn operator_confirmation(&self, request: &Request) -> Result<(Device, &'static str, OperatorConfirmation), String> {
+    fn operator_confirmation(&self, request: &Request) -> Result<(Confirmation, OperatorConfirmation), String> {
         let at_work = self.cell.state().phase().and_then(Phase::moving_device);
         let job = || at_work.ok_or("no machine has a job in progress, so there is no job to confirm");
         let identity = |map: &Option<String>| map.as_ref().map(|digits| self.map_identity(digits)).transpose();
         Ok(match request {
-            Request::Started { map } => {
-                (job()?, "started", OperatorConfirmation::Started { map_identity: identity(map)? })
-            }
+            Request::Started { map } => (
+                Confirmation::Started { device: job()?, map: map.clone() },
+                OperatorConfirmation::Started { map_identity: identity(map)? },
+            ),
             Request::Done { map, file } => {
-                (job()?, "done", OperatorConfirmation::Done { map_identity: identity(map)?, file: file.clone() })
+                let recorded = file.as_ref().map(|file| file.to_string_lossy().into_owned());
+                (
+                    Confirmation::Done { device: job()?, map: map.clone(), file: recorded },
+                    OperatorConfirmation::Done { map_identity: identity(map)?, file: file.clone() },
+                )
             }
             Request::Still { device } => {
                 let device =
                     device.or(at_work).ok_or("name the machine that is at rest: --machine cmm or --machine grinder")?;
-                (device, "still", OperatorConfirmation::Still)
+                (Confirmation::Still { device }, OperatorConfirmation::Still)
             }
             _ => return Err("this order is not a confirmation for a machine".into()),
         })
@@ -700,8 +704,8 @@ impl Drive {
             self.notes[device as usize] = all;
             self.status.send_replace(self.snapshot());
             if !messages.is_empty() {
-                let payload = json!({ "device": device, "notes": messages });
-                self.record_note(RecordKind::Note, (device.to_string(), "wire".into()), payload);
+                let notes = record::MachineNotes { device, notes: messages.clone() };
+                self.record_note(&device.to_string(), &Content::MachineNotes(notes));
                 self.notify(Notice::Note { device, messages });
             }
         }
@@ -709,8 +713,7 @@ impl Drive {
             self.update_preview(&preliminary);
         }
         if let Some(FetchedResult::Record(record)) = &fetched {
-            let payload = json!({ "pass_record": pass_record::pass_record_document(record) });
-            self.record_note(RecordKind::Note, ("grinder".into(), "wire".into()), payload);
+            self.record_note("grinder", &Content::Pass(pass_record::pass_note(record)));
             if let Some(reason) = self.pass_record_flaw(record) {
                 self.handle_event(Event::RecordDoubted { cycle: self.cell.cycle(), reason }, None).await;
             }
@@ -721,7 +724,10 @@ impl Drive {
         }
         if let Some(event) = event {
             if let Event::Prepared { device, .. } = &event {
-                self.armed[*device as usize].clone_from(&detail);
+                self.armed[*device as usize] = match detail {
+                    Some(EventDetail::Preparation(intent)) => Some(intent),
+                    _ => None,
+                };
             }
             self.handle_event(event, detail).await;
         }
@@ -761,8 +767,9 @@ impl Drive {
         let cycle = BatchId::decode(measurement.cycle).cycle;
         let (points, seconds) = (measurement.points.len(), taken.as_secs_f64());
         let ms_per_point = 1e3 * seconds / points.max(1) as f64;
-        let payload = json!({ "transfer": { "points": points, "seconds": seconds, "ms_per_point": ms_per_point, "coordinates": measurement.coordinates } });
-        self.record_note(RecordKind::Note, ("cmm".into(), "wire".into()), payload);
+        let coordinates = Some(measurement.coordinates);
+        let transfer = Transfer { points, seconds, ms_per_point: Some(ms_per_point), coordinates };
+        self.record_note("cmm", &Content::Transfer(TransferNote { transfer }));
         self.notify(Notice::Transferred { cycle, points, seconds, ms_per_point });
     }
 
@@ -812,7 +819,7 @@ impl Drive {
     /// Records `event`, lets the cell handle it, and starts the execution of the resulting commands. `detail` is stored
     /// in the record of the event. Returns the reason if the cell refuses the event, otherwise `None`. Also returns a
     /// receipt that completes when the event is recorded or cannot be recorded.
-    async fn handle_event(&mut self, event: Event, detail: Option<Value>) -> (Option<String>, RecordReceipt) {
+    async fn handle_event(&mut self, event: Event, detail: Option<EventDetail>) -> (Option<String>, RecordReceipt) {
         let now = self.now();
         let ticket = self.record_event(now, &event, detail);
         let before = self.cell.state();
@@ -836,28 +843,32 @@ impl Drive {
         (refusal, ticket)
     }
 
-    fn record_event(&mut self, now: Duration, event: &Event, detail: Option<Value>) -> RecordReceipt {
-        let mut payload = serde_json::to_value(event).unwrap_or(Value::Null);
-        if let (Some(map), Some(detail)) = (payload.as_object_mut(), detail) {
-            map.insert("detail".into(), detail);
-        }
-        let ticket = self.recorder.append(entry(RecordKind::Event, now, self.cell.cycle(), event.origin(), payload));
+    fn record_event(&mut self, now: Duration, event: &Event, detail: Option<EventDetail>) -> RecordReceipt {
+        let content = EventRecord { event: event.clone(), detail };
+        let ticket = self.append(now, event.origin(), &Content::Event(Box::new(content)));
         // Record the outcome of each command that the event answers.
         let (answered, open): (Vec<_>, Vec<_>) =
             std::mem::take(&mut self.open_commands).into_iter().partition(|(_, c)| outcome::answers(event, c));
         self.open_commands = open;
         for (intent, _) in answered {
-            let payload = json!({ "event": event.name() });
-            let record = entry(RecordKind::Outcome, now, self.cell.cycle(), event.origin(), payload);
-            let ticket = self.recorder.append_outcome(intent, record);
+            let answer = Content::Answer(record::Answer::Event { event: event.name().to_owned() });
+            let entry = answer.entry(nanoseconds(now), self.cell.cycle(), event.origin());
+            let ticket = self.recorder.append_outcome(intent, entry);
             self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Nothing });
         }
         ticket
     }
 
-    fn record_note(&mut self, kind: RecordKind, actor: (String, String), payload: Value) {
-        let ticket = self.recorder.append(entry(kind, self.now(), self.cell.cycle(), actor, payload));
+    /// Queues a record of what the machine `actor` reported besides events.
+    fn record_note(&mut self, actor: &str, content: &Content) {
+        let ticket = self.append(self.now(), (actor.to_owned(), "wire".to_owned()), content);
         self.backlog.push_back(PendingRecord { receipt: ticket, action: RecordAction::Nothing });
+    }
+
+    /// Queues a record with `content`. `now` is the time since the run began. `origin` is the person or machine that
+    /// caused the content, and its place.
+    fn append(&self, now: Duration, origin: (String, String), content: &Content) -> RecordReceipt {
+        self.recorder.append(content.entry(nanoseconds(now), self.cell.cycle(), origin))
     }
 
     /// Writes `document` as JSON to the file `name`, relative to the run folder, and records the file. If it cannot be
@@ -874,17 +885,15 @@ impl Drive {
     /// Queues a command to be recorded, and executed after that. An immediate command ([`is_immediate`]) is only
     /// recorded here, because [`Self::handle_event`] has already executed it.
     fn queue_command(&mut self, command: Command) {
-        let mut payload = serde_json::to_value(&command).unwrap_or(Value::Null);
-        if let (Command::StartMachine { device, .. }, Some(map)) = (&command, payload.as_object_mut()) {
-            map.insert("intent".into(), self.armed[*device as usize].clone().unwrap_or(Value::Null));
-        }
-        let record = Entry::new(RecordKind::Intent, recorder::nanoseconds(self.now()), self.cell.cycle(), payload);
-        let ticket = if outcome::expects_answer(&command) {
-            let (intent, ticket) = self.recorder.append_intent(record);
+        let content = Content::Command(Box::new(CommandRecord::new(command.clone(), self.armed)));
+        let origin = ("cell".to_owned(), "regrind".to_owned());
+        let ticket = if command.expects_answer() {
+            let entry = content.entry(nanoseconds(self.now()), self.cell.cycle(), origin);
+            let (intent, ticket) = self.recorder.append_intent(entry);
             self.open_commands.push((intent, command.clone()));
             ticket
         } else {
-            self.recorder.append(Entry { kind: RecordKind::Note, ..record })
+            self.append(self.now(), origin, &content)
         };
         let then =
             if is_immediate(&command) { RecordAction::Nothing } else { RecordAction::Execute(Box::new(command)) };
@@ -1175,6 +1184,11 @@ fn spawn_station<D: StationDriver>(
     let station = MachineTask::new(driver, job, interrupt.clone(), reports.clone(), armed);
     let station = if may_be_at_work { station.restore_preparation() } else { station };
     (asks, tokio::spawn(station.serve(asked, poll, AbortCounter::new(aborts.subscribe()), pulse.clone())))
+}
+
+/// Returns the name of a person and the place of the person, as a record has them.
+fn origin(actor: &Actor) -> (String, String) {
+    (actor.name.clone(), actor.station.clone())
 }
 
 /// Returns true for a command that is executed at once, before it is recorded: it brings machines to rest, only reads a

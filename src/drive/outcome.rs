@@ -2,19 +2,6 @@
 
 use crate::cell::{Command, Device, Event, MachineRequest, Reconciliation};
 
-/// Returns true if an event is expected as the answer to a command. A command without an answer (such as an alarm) is
-/// complete when it is issued.
-pub(super) fn expects_answer(command: &Command) -> bool {
-    !matches!(
-        command,
-        Command::Announce(_)
-            | Command::Raise(_)
-            | Command::Withdraw { .. }
-            | Command::Refuse { .. }
-            | Command::Finish(_)
-    )
-}
-
 /// Returns true if `event` is the answer to `command`. The reconciliation of a START (the question to the machine
 /// whether it executes the job) is an answer only if its outcome is known. Otherwise the START stays without an answer.
 pub(super) fn answers(event: &Event, command: &Command) -> bool {

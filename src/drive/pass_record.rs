@@ -1,10 +1,9 @@
 //! Plausibility check of a grinder's pass record against the commanded pass. An implausible figure holds the cell
 //! before anything is done with it.
 
-use serde_json::{Value, json};
-
 use crate::device::{Job, Outcome, Pass, PassRecord};
 use crate::geometry::Aperture;
+use crate::record::{PassFigures, PassNote};
 
 /// Maximum relative difference of the wheel radius from the recipe. A larger one means another wheel; wear and dressing
 /// stay below it.
@@ -105,18 +104,20 @@ fn format_figure(value: f64) -> String {
     if value.abs() < 1e9 { format!("{value:.3}") } else { format!("{value:e}") }
 }
 
-/// Converts a pass record into the JSON that the journal stores.
-pub(super) fn pass_record_document(record: &PassRecord) -> Value {
-    json!({
-        "path_mm": record.path_mm,
-        "removed_mm3": record.removed_mm3,
-        "deepest_mm": record.max_depth_mm,
-        "idle_share": record.idle_share,
-        "spindle_load": record.spindle_load,
-        "wheel_radius_mm": record.wheel_radius_mm,
-        "temperature_c": record.temperature_c,
-        "duration_s": record.duration_s,
-    })
+/// Converts a pass record into the note that the journal stores.
+pub(super) fn pass_note(record: &PassRecord) -> PassNote {
+    PassNote {
+        pass_record: PassFigures {
+            path_mm: record.path_mm,
+            removed_mm3: record.removed_mm3,
+            max_depth_mm: record.max_depth_mm,
+            idle_share: record.idle_share,
+            spindle_load: record.spindle_load,
+            wheel_radius_mm: record.wheel_radius_mm,
+            temperature_c: record.temperature_c,
+            duration_s: record.duration_s,
+        },
+    }
 }
 
 #[cfg(test)]

@@ -390,10 +390,3 @@ fn record_failure(error: JournalError) -> RecordFailure {
         RecordFailure::Unwritable(error.to_string())
     }
 }
-
-/// Creates a journal entry of the kind `kind` with the content `payload`. `now` is the time since the run began.
-/// `actor` contains the name of the person or machine that caused the entry, and the place from which it came.
-pub(super) fn entry(kind: RecordKind, now: Duration, cycle: u32, actor: (String, String), payload: Value) -> Entry {
-    let (actor, station) = actor;
-    Entry { actor, station, ..Entry::new(kind, nanoseconds(now), cycle, payload) }
-}

@@ -3,14 +3,14 @@
 
 use std::time::Duration;
 
-use serde_json::json;
 use thiserror::Error;
 use tokio::time::Instant;
 
 use super::recorder::nanoseconds;
 use crate::cell::{Actor, Device};
-use crate::device::{Answer, DeviceError, Fault, Machine, MachineState, Status};
-use crate::journal::{Entry, Journal, JournalError, RecordKind};
+use crate::device::{self, DeviceError, Fault, Machine, MachineState, Status};
+use crate::journal::{Entry, Journal, JournalError};
+use crate::record::{Answer, Content, RecoveryOrder};
 
 /// Interval between two status reads of a machine in motion.
 const STATUS_INTERVAL: Duration = Duration::from_millis(200);
@@ -120,12 +120,10 @@ pub async fn execute_step<M: Machine>(
         return Err(RecoveryError::Changed { device, shown: describe_status(seen), found: describe_status(&found) });
     }
     claim_with_retry(machine).await?;
-    let by = |kind, payload| {
-        let (actor, station) = (by.name.clone(), by.station.clone());
-        Entry { actor, station, ..Entry::new(kind, nanoseconds(began.elapsed()), 0, payload) }
-    };
-    let payload = json!({ "recover": step.name(), "device": device, "seen": describe_status(&found) });
-    let intent = journal.intend(by(RecordKind::Intent, payload))?;
+    let entry =
+        |content: Content| content.entry(nanoseconds(began.elapsed()), 0, (by.name.clone(), by.station.clone()));
+    let order = RecoveryOrder { recover: step.name().to_owned(), device, seen: Some(describe_status(&found)) };
+    let intent = journal.intend(entry(Content::Recovery(order)))?;
     let given = match step {
         RecoveryStep::Stop => machine.stop().await,
         RecoveryStep::Acknowledge => machine.acknowledge(found.done).await,
@@ -136,7 +134,7 @@ pub async fn execute_step<M: Machine>(
         Err(error) => Err(error.into()),
     };
     let told = ended.as_ref().map_or_else(ToString::to_string, describe_status);
-    journal.append(Entry { command_id: Some(intent), ..by(RecordKind::Outcome, json!({ "found": told })) })?;
+    journal.append(Entry { command_id: Some(intent), ..entry(Content::Answer(Answer::Found { found: told })) })?;
     // Optional: a machine whose owner is silent can be claimed by the next client.
     let _ = machine.release().await;
     ended
@@ -151,7 +149,7 @@ async fn claim_with_retry<M: Machine>(machine: &mut M) -> Result<(), DeviceError
     let by = Instant::now() + OWNER_RELEASE_TIME;
     loop {
         match machine.claim().await {
-            Err(DeviceError::Refused { answer: Answer::NotOwner, .. }) if Instant::now() < by => {
+            Err(DeviceError::Refused { answer: device::Answer::NotOwner, .. }) if Instant::now() < by => {
                 tokio::time::sleep(CLAIM_RETRY_INTERVAL).await;
             }
             claimed => return claimed.map(drop),

@@ -25,15 +25,15 @@ use super::Task;
 use super::comparison::{is_same_decision, is_same_file, is_same_result};
 use super::computation::{Computation, batch_folder, create_folder, cycle_folder};
 use super::cycles::Cycles;
-use super::outcome;
 use super::pipeline;
 use super::recorder::OutputFiles;
-use super::station::StartIntent;
+use super::station::prepared_job;
 use super::task::ComputationProduct;
 use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, GateResult, Judgement};
 use crate::device::{Armed, BatchId, Coordinates, Identified, digest};
 use crate::formats::{self, FormatError, ScratchFolder};
 use crate::journal::{Artefact, JournalError, Reader, Record, RecordKind, sha256_hex};
+use crate::record::{Content, EventDetail, EventRecord, StartIntent, TransferNote};
 
 /// Folder for the repeated computations, below the run folder; removed afterwards.
 const SCRATCH: &str = "replay";
@@ -43,7 +43,7 @@ pub struct InterruptedRun {
     pub(super) cell: Cell,
     pub(super) cycles: Cycles,
     /// Last preparation of each machine: CMM, grinder.
-    pub(super) armed: [Option<Value>; 2],
+    pub(super) armed: [Option<StartIntent>; 2],
     /// Number of attempts of each computation, so that no file is overwritten.
     pub(super) attempts: BTreeMap<(u32, Computation), u32>,
     pub(super) state_changes: u64,
@@ -118,14 +118,11 @@ impl InterruptedRun {
     /// job. Returns `None` if no START was prepared. The second value is true if the machine may still execute this
     /// job.
     pub(super) fn last_preparation(&self, device: Device) -> (Option<(u32, Armed)>, bool) {
-        let intent = self.armed[device as usize].clone();
-        let Some(intent) = intent.and_then(|value| serde_json::from_value::<StartIntent>(value).ok()) else {
-            return (None, false);
-        };
+        let Some(intent) = self.armed[device as usize] else { return (None, false) };
         let cycle = BatchId::decode(intent.cycle).cycle;
         let state = self.cell.state();
         let at_work = state.phase().map_or(!state.is_end(), |phase| phase.moving_device() == Some(device));
-        (Some((cycle, intent.to_armed())), at_work && cycle == self.cell.cycle())
+        (Some((cycle, prepared_job(intent))), at_work && cycle == self.cell.cycle())
     }
 
     /// Returns the state in which the run was interrupted, in words.
@@ -168,35 +165,36 @@ impl<'t> Replay<'t> {
     fn apply_record(&mut self, record: &Record) -> Result<(), ReplayError> {
         self.last_sequence = record.seq;
         self.replayed.elapsed = self.replayed.elapsed.max(Duration::from_nanos(record.mono_ns));
-        let payload = record.value();
-        match record.kind {
-            RecordKind::Begin | RecordKind::End | RecordKind::Seal => Ok(()),
+        let content = Content::read(record).map_err(|error| self.unreadable(&error))?;
+        match content {
             // Decisions that the program had not recorded when it ended were not executed.
-            RecordKind::Reopen => {
-                self.due_commands.clear();
-                Ok(())
+            Content::Reopen(_) => self.due_commands.clear(),
+            Content::Artefact(file) => self.add_recorded_file(file),
+            Content::Event(event) => return self.apply_event(Duration::from_nanos(record.mono_ns), *event),
+            Content::Command(command) => {
+                return self.compare_command(record.command_id, &command.command, record.value());
             }
-            RecordKind::Artefact => {
-                self.add_recorded_file(serde_json::from_value(payload).map_err(|error| self.unreadable(&error))?);
-                Ok(())
+            Content::Transfer(TransferNote { transfer }) => {
+                self.coordinates = transfer.coordinates.or(self.coordinates);
             }
-            RecordKind::Outcome => {
-                self.replayed.open_commands.retain(|id, _| Some(*id) != record.command_id);
-                Ok(())
-            }
-            RecordKind::Event => self.apply_event(Duration::from_nanos(record.mono_ns), payload),
-            RecordKind::Intent | RecordKind::Note if payload["command"].is_string() => {
-                self.compare_command(record.command_id, payload)
-            }
-            RecordKind::Intent | RecordKind::Note => {
-                let told = &payload["transfer"]["coordinates"];
-                if !told.is_null() {
-                    let told = serde_json::from_value(told.clone()).map_err(|error| self.unreadable(&error))?;
-                    self.coordinates = Some(told);
-                }
-                Ok(())
-            }
+            Content::Answer(_) => self.close_command(record),
+            Content::Unknown(_) if record.kind == RecordKind::Outcome => self.close_command(record),
+            Content::Begin(_)
+            | Content::Recovery(_)
+            | Content::Confirmation(_)
+            | Content::MachineNotes(_)
+            | Content::Remark(_)
+            | Content::Pass(_)
+            | Content::Seal(_)
+            | Content::End(_)
+            | Content::Unknown(_) => {}
         }
+        Ok(())
+    }
+
+    /// Removes the command that `record`, an outcome, answers from the open commands.
+    fn close_command(&mut self, record: &Record) {
+        self.replayed.open_commands.retain(|id, _| Some(*id) != record.command_id);
     }
 
     fn add_recorded_file(&mut self, file: Artefact) {
@@ -212,16 +210,20 @@ impl<'t> Replay<'t> {
         self.files.insert((cycle, name.to_owned()), file);
     }
 
-    fn apply_event(&mut self, now: Duration, payload: Value) -> Result<(), ReplayError> {
+    fn apply_event(&mut self, now: Duration, record: EventRecord) -> Result<(), ReplayError> {
         if let Some(missing) = self.due_commands.front() {
             return Err(self.differs(format!(
                 "the program would send {}, but the record has an event in place of this command",
                 missing.name()
             )));
         }
-        let event: Event = serde_json::from_value(payload.clone()).map_err(|error| self.unreadable(&error))?;
+        let EventRecord { event, detail } = record;
         if let Event::Prepared { device, .. } = &event {
-            self.replayed.armed[*device as usize] = payload.get("detail").cloned();
+            self.replayed.armed[*device as usize] = match detail {
+                Some(EventDetail::Preparation(intent)) => Some(intent),
+                Some(_) => return Err(self.unreadable(&"its detail is not a prepared job")),
+                None => None,
+            };
         }
         self.repeat_computation(&event)?;
         let before = self.replayed.cell.state();
@@ -248,11 +250,11 @@ impl<'t> Replay<'t> {
         }
     }
 
-    /// Checks that a recorded command is the next one that the cell issues in the replay. `id` is its number in the
-    /// journal. Returns an error if the two commands differ.
-    fn compare_command(&mut self, id: Option<u32>, mut recorded: Value) -> Result<(), ReplayError> {
-        let name = recorded["command"].as_str().unwrap_or_default().to_owned();
+    /// Checks that the recorded command `told` is the next one that the cell issues in the replay. `id` is its number in
+    /// the journal, and `recorded` is the content of its record. Returns an error if the two commands differ.
+    fn compare_command(&mut self, id: Option<u32>, told: &Command, mut recorded: Value) -> Result<(), ReplayError> {
         let Some(command) = self.due_commands.pop_front() else {
+            let (name, _) = told.label();
             return Err(
                 self.differs(format!("the program would send no command, but the record has the command {name}"))
             );
@@ -264,7 +266,7 @@ impl<'t> Replay<'t> {
         if !is_same_decision(&due, &recorded) {
             return Err(self.differs(format!("the program would send {due}, but the record has {recorded}")));
         }
-        if let Some(id) = id.filter(|_| outcome::expects_answer(&command)) {
+        if let Some(id) = id.filter(|_| command.expects_answer()) {
             self.replayed.open_commands.insert(id, command);
         }
         Ok(())
@@ -439,8 +441,7 @@ impl<'t> Replay<'t> {
     }
 
     fn check_preparation(&mut self, device: Device) -> Result<(), ReplayError> {
-        let Some(value) = self.replayed.armed[device as usize].clone() else { return Ok(()) };
-        let intent: StartIntent = serde_json::from_value(value).map_err(|error| self.unreadable(&error))?;
+        let Some(intent) = self.replayed.armed[device as usize] else { return Ok(()) };
         let BatchId { cycle: number, batch } = BatchId::decode(intent.cycle);
         let Some(cycle) = self.replayed.cycles.get(number) else { return Ok(()) };
         // A preparation from before the plan of the next batch is over.

@@ -10,7 +10,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use serde::Serialize;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
@@ -24,6 +23,7 @@ use crate::device::{
     Measurement, OperatorConfirmation, Outcome, Pass, PassRecord, Plan, PreliminaryPoints, Reconciled, SignalValue,
     Status, digest,
 };
+use crate::record::{EventDetail, StartIntent};
 
 /// Request to a machine. The answers are the events that [`crate::cell::Command`] names.
 pub(super) enum StationRequest {
@@ -70,7 +70,7 @@ pub(super) struct MachineNotes {
 pub(super) struct StationReport {
     /// `None` if the drive itself creates the event from the fetched result.
     pub(super) event: Option<Event>,
-    pub(super) detail: Option<serde_json::Value>,
+    pub(super) detail: Option<EventDetail>,
     pub(super) fetched: Option<FetchedResult>,
     /// Points that a CMM gives while it still measures.
     pub(super) preliminary: Option<PreliminaryPoints>,
@@ -383,7 +383,7 @@ impl<B: StationDriver> MachineTask<B> {
         self.report_with_detail(event, None).await;
     }
 
-    async fn report_with_detail(&mut self, event: Event, detail: Option<serde_json::Value>) {
+    async fn report_with_detail(&mut self, event: Event, detail: Option<EventDetail>) {
         // The drive listens until it drops the last ask; after that no one needs the event.
         let _ = self.reports.send(StationReport { event: Some(event), detail, ..StationReport::default() }).await;
     }
@@ -449,7 +449,8 @@ impl<B: StationDriver> MachineTask<B> {
                 self.observed.state = Some(status.state);
                 let occupation = self.occupation(&status).await;
                 let (device, boot_id, simulated) = (B::DEVICE, identity.boot_id, identity.simulation);
-                let detail = serde_json::json!({ "name": identity.name, "address": self.driver.machine().name() });
+                let (name, address) = (identity.name.clone(), self.driver.machine().name().to_string());
+                let detail = EventDetail::Machine { name, address };
                 self.report_with_detail(Event::Connected { device, boot_id, simulated, occupation }, Some(detail))
                     .await;
             }
@@ -486,7 +487,7 @@ impl<B: StationDriver> MachineTask<B> {
                     MachinePayload::Plan(_) => Event::PlanLoaded { cycle },
                     MachinePayload::Pass(..) => Event::PassLoaded { cycle },
                 };
-                let detail = serde_json::json!({ "digest": format!("{digest:08x}") });
+                let detail = EventDetail::Payload { digest: format!("{digest:08x}") };
                 self.report_with_detail(event, Some(detail)).await;
             }
             Err(error) => self.report_failure(MachineRequest::Load, error).await,
@@ -529,7 +530,7 @@ impl<B: StationDriver> MachineTask<B> {
         };
         match prepared.await {
             Ok(armed) => {
-                let detail = intent_document(&armed);
+                let detail = EventDetail::Preparation(start_intent(&armed));
                 self.armed = Some(armed);
                 self.cycle = cycle;
                 self.observed.state = Some(MachineState::Prepared);
@@ -563,7 +564,7 @@ impl<B: StationDriver> MachineTask<B> {
             Ok(started) => {
                 self.observed.state = Some(MachineState::Execute);
                 self.observed.at_job = started.status.state.is_moving();
-                let detail = serde_json::json!({ "start_sequence": started.start_sequence });
+                let detail = EventDetail::Start { start_sequence: started.start_sequence };
                 self.report_with_detail(Event::Started { device: B::DEVICE, cycle }, Some(detail)).await;
             }
             Err(error @ (DeviceError::Refused { .. } | DeviceError::Faulted { .. })) => {
@@ -1163,29 +1164,17 @@ fn mismatch(error: &DeviceError) -> ConnectionRefusal {
     }
 }
 
-/// Intent of a START, as the journal stores it.
-#[derive(Serialize, serde::Deserialize)]
-pub(super) struct StartIntent {
-    pub(super) job: u32,
-    pub(super) cycle: u16,
-    pub(super) digest: u32,
-    pub(super) start_sequence: u32,
-    pub(super) token: u32,
-    pub(super) boot_id: u32,
+/// Converts a recorded intent of a START into the data of the prepared job that a driver uses, for example to reconcile
+/// the job.
+pub(super) fn prepared_job(intent: StartIntent) -> Armed {
+    let job = Job { job: intent.job, cycle: intent.cycle, digest: intent.digest };
+    Armed { job, start_sequence: intent.start_sequence, token: intent.token, boot_id: intent.boot_id }
 }
 
-impl StartIntent {
-    /// Converts this recorded intent of a START into the data of the prepared job that a driver uses, for example to
-    /// reconcile the job.
-    pub(super) fn to_armed(&self) -> Armed {
-        let job = Job { job: self.job, cycle: self.cycle, digest: self.digest };
-        Armed { job, start_sequence: self.start_sequence, token: self.token, boot_id: self.boot_id }
-    }
-}
-
-fn intent_document(armed: &Armed) -> serde_json::Value {
+/// Converts a prepared job into the intent of its START, as the journal stores it.
+fn start_intent(armed: &Armed) -> StartIntent {
     let Armed { job: Job { job, cycle, digest }, start_sequence, token, boot_id } = *armed;
-    serde_json::to_value(StartIntent { job, cycle, digest, start_sequence, token, boot_id }).expect("numbers are JSON")
+    StartIntent { job, cycle, digest, start_sequence, token, boot_id }
 }
 
 #[cfg(test)]

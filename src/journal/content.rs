@@ -72,7 +72,7 @@ pub enum KeyField {
 
 impl KeyField {
     /// Returns the public key that belongs to `key`, as a record names it.
-    pub(super) fn of(key: &AuditKey) -> Self {
+    pub(super) fn new(key: &AuditKey) -> Self {
         Self::Key(key.public())
     }
 }

@@ -135,7 +135,7 @@ impl Journal {
             first_command_id: Some(first_command_id),
             content,
             regrind: Some(VERSION.to_owned()),
-            key: journal.key.as_ref().map(KeyField::of),
+            key: journal.key.as_ref().map(KeyField::new),
         };
         journal.append(Entry { actor, station, ..Entry::new(RecordKind::Begin, 0, 0, begin) })?;
         journal.anchor()?;
@@ -191,7 +191,7 @@ impl Journal {
             _lock: lock,
         };
         journal.is_whole()?;
-        let reopen = Reopen { regrind: Some(VERSION.to_owned()), key: journal.key.as_ref().map(KeyField::of) };
+        let reopen = Reopen { regrind: Some(VERSION.to_owned()), key: journal.key.as_ref().map(KeyField::new) };
         journal.append(Entry::new(RecordKind::Reopen, 0, journal.tail.cycle, reopen))?;
         journal.anchor()?;
         Ok(journal)

@@ -5,8 +5,8 @@ use std::fs;
 use std::path::Path;
 
 use regrind_journal::{
-    Anchor, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Verified, restore, restore_file,
-    verify_against,
+    Anchor, Begin, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Seal, Verified, restore,
+    restore_file, verify_against,
 };
 use serde_json::Value;
 
@@ -170,17 +170,12 @@ impl PlantRun {
 /// `records`. A seal is a record that signs the records before it. If there is no seal, returns an unsigned anchor of
 /// the last record. Returns `None` if `records` is empty, or if the seal lacks the number or the hash.
 fn last_sealed(records: &[Record]) -> Option<Anchor> {
-    let Some(seal) = records.iter().rev().find(|record| record.kind == RecordKind::Seal).map(Record::value) else {
+    let Some(seal) = records.iter().rev().find(|record| record.kind == RecordKind::Seal) else {
         return records.last().map(|last| Anchor::new(last.seq, last.hash.clone()));
     };
-    let word = |value: &Value, key: &str| value[key].as_str().map(str::to_owned);
-    Some(Anchor {
-        records: seal["records"].as_u64()?,
-        head: word(&seal, "head")?,
-        run: word(&records.first()?.value(), "run"),
-        key: word(&seal, "key"),
-        signature: word(&seal, "signature"),
-    })
+    let Seal { records: sealed, head, key, signature } = serde_json::from_str(&seal.payload).ok()?;
+    let run = Begin::<Value>::read(records.first()?).and_then(|begin| begin.run);
+    Some(Anchor { records: sealed, head, run, key: Some(key), signature: Some(signature) })
 }
 
 /// Returns the content of the file with the SHA-256 hash `sha256`. Reads the content from the database or from the

@@ -26,7 +26,6 @@ mod plot;
 mod ply;
 mod qif;
 mod raster;
-mod record_content;
 mod results;
 mod results_file;
 mod run;

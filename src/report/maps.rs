@@ -3,8 +3,6 @@
 use std::fmt::Write;
 use std::path::Path;
 
-use serde_json::Value;
-
 use super::convergence::histogram;
 use super::heat_map::HeatMap;
 use super::run::when;
@@ -72,18 +70,18 @@ fn shortened(text: &str, width: f64, letter: f64) -> String {
 
 /// Returns the HTML section of the filtered error maps. It contains the maps of the first and the last cycle on one
 /// colour scale, the map of the last cycle on its own scale, and the histogram of that map. If only one cycle has a
-/// map, the pair on one scale is omitted. `folder` is the run folder. `begin` is the content of the first record of the
-/// run. Returns an empty text if no cycle has an error map.
+/// map, the pair on one scale is omitted. `folder` is the run folder. Returns an empty text if no cycle has an error map.
 ///
 /// # Errors
 /// Fails if the file of an error map cannot be read, or if the histogram cannot be drawn.
-pub(super) fn maps(story: &RunHistory, folder: &Path, begin: &Value) -> Result<String, ReportError> {
+pub(super) fn maps(story: &RunHistory, folder: &Path) -> Result<String, ReportError> {
     let mapped = || story.cycles.iter().filter_map(|(cycle, told)| Some((*cycle, told.map.as_ref()?)));
     let Some(last) = mapped().next_back() else { return Ok(String::new()) };
     let first = mapped().next().filter(|(cycle, _)| *cycle != last.0);
-    let part = begin["content"]["part_name"].as_str().unwrap_or("Part");
+    let [part, ..] = story.start.content.names();
+    let part = part.unwrap_or("Part");
     let serial = story.begin.as_ref().map_or("", |begin| begin.part.as_str());
-    let mark = if begin["simulation"] == true { " (SIMULATION)" } else { "" };
+    let mark = if story.start.simulation == Some(true) { " (SIMULATION)" } else { "" };
     let read = |(cycle, (name, utc)): (u32, &(String, String))| -> Result<CycleMap, ReportError> {
         let nodes = read_error_map(&folder.join(name))?;
         let samples_um = nodes.iter().map(MapNode::error).map(|[x, y, error_mm]| [x, y, 1e3 * error_mm]).collect();

@@ -80,9 +80,9 @@ pub(super) enum LimitStatus {
 
 impl Results {
     pub(super) fn from_history(story: &RunHistory, head: String) -> Self {
-        let begin = story.begin.as_ref().map(Record::value).unwrap_or_default();
-        let text = |value: &serde_json::Value| value.as_str().unwrap_or_default().to_owned();
-        let content = |key: &str| text(&begin["content"][key]);
+        let start = &story.start;
+        let text = |text: &Option<String>| text.clone().unwrap_or_default();
+        let part = start.content.part().cloned().unwrap_or_default();
         let of_begin = |field: fn(&Record) -> &String| story.begin.as_ref().map(field).cloned().unwrap_or_default();
         let tolerance = story.tolerance();
         let all = |(cycle, of): (&u32, &CycleHistory)| {
@@ -90,17 +90,17 @@ impl Results {
             of.measurements.iter().map(measured).collect::<Vec<_>>()
         };
         Self {
-            run: text(&begin["run"]),
+            run: text(&start.run),
             part: of_begin(|begin| &begin.part),
-            name: content("part_name"),
-            recipe: [content("recipe"), content("recipe_sha256")],
-            cell: [content("cell"), content("cell_sha256")],
+            name: text(&part.part_name),
+            recipe: [text(&part.recipe), text(&part.recipe_sha256)],
+            cell: [text(&part.cell), text(&part.cell_sha256)],
             operator: of_begin(|begin| &begin.actor),
             station: of_begin(|begin| &begin.station),
             began: of_begin(|begin| &begin.utc),
             ended: story.end.as_ref().map(|end| end.utc.clone()),
-            software: text(&begin["regrind"]),
-            simulation: begin["simulation"] == true,
+            software: text(&start.regrind),
+            simulation: start.simulation == Some(true),
             accepted: story.ending.as_ref().map(|ending| matches!(ending, Ending::Accepted { .. })),
             verdict: story.ending.as_ref().map_or("The run has not ended.".to_owned(), ending_words),
             decision_rule: tolerance.as_ref().map(decision_rule),

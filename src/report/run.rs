@@ -6,8 +6,6 @@
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use serde_json::Value;
-
 use super::ReportError;
 use super::convergence::convergence;
 use super::equipment::{equipment, last_model, last_registration, registered, signatures};
@@ -17,7 +15,8 @@ use super::run_history::{Measurement, PassHistory, RunHistory};
 use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
 use regrind_cell::{ComparedFigure, Conformity, Ending, Figures, JobResult, RecordedParameter, Tolerance};
 use regrind_formats::{escaped, write_atomic};
-use regrind_journal::{Record, Verified};
+use regrind_journal::Verified;
+use regrind_record::TouchCounts;
 
 /// File name of the report in a run folder.
 pub const RUN_REPORT: &str = "report.html";
@@ -58,12 +57,10 @@ pub fn run_report(folder: &Path) -> Result<String, ReportError> {
 }
 
 fn html(story: &RunHistory, folder: &Path, verified: &Verified) -> Result<String, ReportError> {
-    let begin = story.begin.as_ref().map(Record::value).unwrap_or_default();
-    let name = begin["content"]["part_name"].as_str().unwrap_or("Part");
-    let run = begin["run"].as_str().unwrap_or_default();
-    let (name, run) = (escaped(name), escaped(run));
+    let [name, ..] = story.start.content.names();
+    let (name, run) = (escaped(name.unwrap_or("Part")), escaped(story.start.run.as_deref().unwrap_or_default()));
     let serial = story.begin.as_ref().map_or(String::new(), |begin| format!(", {}", escaped(&begin.part)));
-    let mark = if begin["simulation"] == true { "<p class=\"mark\">SIMULATION</p>\n" } else { "" };
+    let mark = if story.start.simulation == Some(true) { "<p class=\"mark\">SIMULATION</p>\n" } else { "" };
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n<title>{name}, {run}</title>\n\
          <style>{STYLE}</style>\n</head>\n<body>\n{mark}<h1>{name}{serial}</h1>\n"
@@ -72,13 +69,13 @@ fn html(story: &RunHistory, folder: &Path, verified: &Verified) -> Result<String
     html += &broken_off_pass(story);
     html += &judged(story);
     let registration = last_registration(story, folder)?;
-    html += &facts(story, &begin);
+    html += &facts(story);
     html += &equipment(story, registration.as_ref().map(|(_, found)| found));
     html += &cycles(story);
     if let Some(plot) = convergence(story) {
         let _ = writeln!(html, "<figure>{}</figure>", within_html(&plot));
     }
-    html += &maps(story, folder, &begin)?;
+    html += &maps(story, folder)?;
     html += &registration
         .map_or(String::new(), |(cycle, found)| registered(cycle, &found, last_model(story, folder).as_ref()));
     html += &form(story, folder)?;
@@ -222,20 +219,21 @@ fn decision_rule(tolerance: &Tolerance) -> String {
     )
 }
 
-fn facts(story: &RunHistory, begin: &Value) -> String {
+fn facts(story: &RunHistory) -> String {
     let Some(first) = &story.begin else { return String::new() };
-    let content = |key: &str| begin["content"][key].as_str().unwrap_or("not recorded").to_owned();
-    let source = |key: &str| format!("{}, sha256 {}", content(key), content(&format!("{key}_sha256")));
+    let part = story.start.content.part().cloned().unwrap_or_default();
+    let recorded = |text: Option<String>| text.unwrap_or_else(|| "not recorded".to_owned());
+    let source = |path, sha256| format!("{}, sha256 {}", recorded(path), recorded(sha256));
     let ended = story.end.as_ref().map_or("not yet".to_owned(), |end| when(&end.utc));
     let facts = [
         ("Serial number", first.part.clone()),
-        ("Run", begin["run"].as_str().unwrap_or_default().to_owned()),
-        ("Recipe", source("recipe")),
-        ("Cell", source("cell")),
+        ("Run", story.start.run.clone().unwrap_or_default()),
+        ("Recipe", source(part.recipe, part.recipe_sha256)),
+        ("Cell", source(part.cell, part.cell_sha256)),
         ("Operator", format!("{} at {}", first.actor, first.station)),
         ("Began", when(&first.utc)),
         ("Ended", ended),
-        ("Regrind", begin["regrind"].as_str().unwrap_or_default().to_owned()),
+        ("Regrind", story.start.regrind.clone().unwrap_or_default()),
     ];
     let rows = facts.iter().map(|(key, value)| format!("<tr><th>{key}</th><td>{}</td></tr>\n", escaped(value)));
     format!("<h2>Run</h2>\n<table>\n{}</table>\n", rows.collect::<String>())
@@ -266,13 +264,9 @@ fn cycles(story: &RunHistory) -> String {
         let measurements = if cycle.measurements.is_empty() { &none[..] } else { &cycle.measurements };
         html.extend(measurements.iter().map(|of| measurement(*number, of, tolerance.as_ref(), &level)));
     }
-    let touches = story.end.as_ref().map(|end| end.value()["ending"]["touches"].clone()).unwrap_or_default();
-    let touches = match (touches["taken"].as_u64(), touches["whole_patterns"].as_u64()) {
-        (Some(taken), Some(whole)) => {
-            format!("<p>Adaptive measurement: {taken} touches; whole patterns would need {whole}.</p>\n")
-        }
-        _ => String::new(),
-    };
+    let touches = story.touches.map_or(String::new(), |TouchCounts { taken, whole_patterns }| {
+        format!("<p>Adaptive measurement: {taken} touches; whole patterns would need {whole_patterns}.</p>\n")
+    });
     html + "</table>\n"
         + &touches
         + &parameters(story)

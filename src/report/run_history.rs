@@ -3,16 +3,14 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use serde_json::Value;
-
 use super::ReportError;
-use super::record_content::RecordContent;
 use super::words::{gate_words, words};
 use regrind_cell::{
     Alarm, Command, Device, Ending, Event, Figures, GateResult, JobResult, Judgement, Reconciliation,
     RecordedParameter, Tolerance,
 };
-use regrind_journal::{Reader, Record, Verified, verify};
+use regrind_journal::{Reader, Record, RecordKind, Verified, verify};
+use regrind_record::{Begin, Content, EventDetail, EventRecord, PartEnd, RunContent, RunEnd, TouchCounts};
 
 /// File of the error map of a cycle, as text.
 const MAP: &str = "error_map.csv";
@@ -28,9 +26,14 @@ const FIGURES: &str = "figures.json";
 
 #[derive(Default)]
 pub(super) struct RunHistory {
+    /// First record of the run.
     pub(super) begin: Option<Record>,
+    /// Content of the first record.
+    pub(super) start: Begin<RunContent>,
     pub(super) end: Option<Record>,
     pub(super) ending: Option<Ending>,
+    /// Number of touches, if the measurement was adaptive.
+    pub(super) touches: Option<TouchCounts>,
     /// For each machine, true if it came home; `None` if this is not the record of a recovery.
     pub(super) home: Option<[bool; 2]>,
     pub(super) cycles: BTreeMap<u32, CycleHistory>,
@@ -135,34 +138,46 @@ impl RunHistory {
 
     pub(super) fn add_record(&mut self, record: Record) {
         self.last.clone_from(&record.utc);
-        match RecordContent::from_record(&record) {
-            RecordContent::Begun(_) => self.begin = Some(record),
-            RecordContent::Command(command) => self.add_command(record, *command),
-            RecordContent::Event(event) => self.add_event(record, *event),
-            RecordContent::Confirmation(..) | RecordContent::Step(..) => {
+        let Ok(content) = Content::read(&record) else {
+            // An end that this version cannot read is still the end of the run.
+            if record.kind == RecordKind::End {
+                self.end = Some(record);
+            }
+            return;
+        };
+        match content {
+            Content::Begin(start) => {
+                self.start = *start;
+                self.begin = Some(record);
+            }
+            Content::Command(told) => self.add_command(record, told.command),
+            Content::Event(told) => self.add_event(record, *told),
+            Content::Confirmation(_) | Content::Recovery(_) => {
                 self.orders.push(Order { record, event: None, refused: None })
             }
-            RecordContent::File(file) => self.add_file(&record, file["name"].as_str().unwrap_or_default()),
-            RecordContent::End(ending, cycles) => {
-                self.add_levels(&cycles);
-                self.ending = Some(ending);
+            Content::Artefact(file) => self.add_file(&record, &file.name),
+            Content::End(end) => {
+                match end.ending {
+                    RunEnd::Part(PartEnd { ending, cycles, touches, .. }) => {
+                        cycles.iter().for_each(|row| self.cycle(row.cycle).level_um = Some(row.level_um));
+                        (self.ending, self.touches) = (Some(ending), touches);
+                    }
+                    RunEnd::Bare(ending) => self.ending = Some(ending),
+                    RunEnd::Recovery(end) => self.home = Some([end.cmm_home, end.grinder_home]),
+                    RunEnd::Other(_) => {}
+                }
                 self.end = Some(record);
             }
-            RecordContent::Pass(pass) => {
-                self.wheel_radius_mm = pass["wheel_radius_mm"].as_f64().or(self.wheel_radius_mm);
+            Content::Pass(pass) => {
+                self.wheel_radius_mm = pass.pass_record.wheel_radius_mm.or(self.wheel_radius_mm);
             }
-            RecordContent::Home(home) => {
-                self.home = Some(home);
-                self.end = Some(record);
-            }
-            RecordContent::Unknown if record.kind == regrind_journal::RecordKind::End => self.end = Some(record),
-            RecordContent::Reopened
-            | RecordContent::Answer(_)
-            | RecordContent::Remarks(..)
-            | RecordContent::Remark(_)
-            | RecordContent::Transfer(_)
-            | RecordContent::Seal(_)
-            | RecordContent::Unknown => {}
+            Content::Reopen(_)
+            | Content::Answer(_)
+            | Content::MachineNotes(_)
+            | Content::Remark(_)
+            | Content::Transfer(_)
+            | Content::Seal(_)
+            | Content::Unknown(_) => {}
         }
     }
 
@@ -188,7 +203,8 @@ impl RunHistory {
         }
     }
 
-    fn add_event(&mut self, record: Record, event: Event) {
+    fn add_event(&mut self, record: Record, told: EventRecord) {
+        let EventRecord { event, detail } = told;
         match event {
             Event::Collected { cycle, gate, .. } => {
                 let unusable = Some(&gate).filter(|gate| **gate != GateResult::Passed).map(gate_words);
@@ -211,10 +227,10 @@ impl RunHistory {
                 measurement.utc = record.utc;
             }
             Event::Connected { device, .. } => {
-                let detail = &record.value()["detail"];
-                let [name, address] =
-                    ["name", "address"].map(|key| detail[key].as_str().unwrap_or("not reported").to_owned());
-                self.machines[device as usize] = Some([name, address]);
+                self.machines[device as usize] = Some(match detail {
+                    Some(EventDetail::Machine { name, address }) => [name, address],
+                    _ => ["not reported".to_owned(), "not reported".to_owned()],
+                });
             }
             Event::Started { device: Device::Grinder, cycle } => {
                 self.pass = Some(PassHistory { cycle, ground: None, result: None });
@@ -260,14 +276,6 @@ impl RunHistory {
         }
     }
 
-    fn add_levels(&mut self, cycles: &Value) {
-        for row in cycles.as_array().into_iter().flatten() {
-            if let Some(cycle) = row["cycle"].as_u64().and_then(|cycle| u32::try_from(cycle).ok()) {
-                self.cycle(cycle).level_um = row["level_um"].as_f64();
-            }
-        }
-    }
-
     fn cycle(&mut self, number: u32) -> &mut CycleHistory {
         self.cycles.entry(number).or_default()
     }
@@ -284,8 +292,7 @@ impl RunHistory {
 
     /// Returns the tolerance of the recipe, from the first record of the run. Returns `None` if it is not on record.
     pub(super) fn tolerance(&self) -> Option<Tolerance> {
-        let begin = self.begin.as_ref()?.value();
-        serde_json::from_value(begin["content"]["plan"]["tolerance"].clone()).ok()
+        self.start.content.part()?.plan.tolerance()
     }
 
     /// Returns the last measurement that has figures: the number of its cycle, the measurement, and its figures.

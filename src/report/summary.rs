@@ -103,8 +103,8 @@ pub fn run_summary(folder: &Path) -> Result<RunSummary, ReportError> {
 }
 
 fn summary(story: &RunHistory) -> RunSummary {
-    let begin = story.begin.as_ref().map(Record::value).unwrap_or_default();
-    let text = |value: &serde_json::Value| value.as_str().unwrap_or_default().to_owned();
+    let start = &story.start;
+    let [name, recipe, _] = start.content.names().map(|text| text.unwrap_or_default().to_owned());
     let of_begin = |field: fn(&Record) -> &String| story.begin.as_ref().map(field).cloned().unwrap_or_default();
     let (result, verdict) = match (&story.ending, story.home) {
         (Some(ending), _) => (result_of(ending), ending_words(ending)),
@@ -112,17 +112,16 @@ fn summary(story: &RunHistory) -> RunSummary {
         (None, None) => (RunResult::Open, String::new()),
     };
     let tolerance = story.tolerance();
-    let recipe = text(&begin["content"]["recipe"]);
     RunSummary {
-        run: text(&begin["run"]),
+        run: start.run.clone().unwrap_or_default(),
         part: of_begin(|begin| &begin.part),
-        name: text(&begin["content"]["part_name"]),
+        name,
         recipe: Path::new(&recipe).file_stem().map_or(recipe.clone(), |stem| stem.to_string_lossy().into_owned()),
         operator: of_begin(|begin| &begin.actor),
         began: of_begin(|begin| &begin.utc),
         ended: story.end.as_ref().map(|end| end.utc.clone()),
-        simulation: begin["simulation"] == true,
-        machines_within: begin["content"]["machines_within"] == true,
+        simulation: start.simulation == Some(true),
+        machines_within: start.content.part().is_some_and(|part| part.machines_within == Some(true)),
         result,
         verdict,
         cycles: story.cycles.iter().map(|(number, cycle)| cycle_summary(*number, cycle, tolerance.as_ref())).collect(),

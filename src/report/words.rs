@@ -2,20 +2,22 @@
 
 use std::fmt::Write;
 
-use serde_json::Value;
-
-use super::record_content::RecordContent;
 use regrind_cell::{
     Alarm, Command, CompensationRefusal, ConnectionRefusal, Device, Ending, Event, Figures, GateFailure, GateResult,
     Judgement, Occupation, Reconciliation, RecordFailure, RecordedInterval, Role,
 };
+use regrind_formats::result::Coordinates;
 use regrind_journal::Record;
+use regrind_record::{
+    Answer, Artefact, Begin, Confirmation, Content, MachineNotes, PartEnd, PassFigures, RecoveryOrder, Remark,
+    RunContent, RunEnd, Seal, Transfer,
+};
 
 /// Returns the content of a record of the journal as one readable line. The reason of the record, if it has one,
 /// follows in brackets. If this version of the program cannot interpret the content, the line contains the original
 /// text of the record. Control characters are replaced by spaces.
 pub fn words(record: &Record) -> String {
-    let told = content_words(&RecordContent::from_record(record));
+    let told = Content::read(record).ok().and_then(|content| content_words(&content));
     let as_written = || record.value().as_str().map_or_else(|| record.payload.clone(), str::to_owned);
     let mut line = told.unwrap_or_else(as_written);
     if !record.reason.is_empty() {
@@ -25,69 +27,59 @@ pub fn words(record: &Record) -> String {
     line.replace(|c: char| c.is_control(), " ")
 }
 
-fn content_words(told: &RecordContent) -> Option<String> {
-    match told {
-        RecordContent::Begun(value) => begin_words(value),
-        RecordContent::Reopened => Some("reopened".to_owned()),
-        RecordContent::Command(command) => Some(command_words(command)),
-        RecordContent::Event(event) => Some(event_words(event)),
-        RecordContent::Answer(answer) => Some(format!("answered: {answer}")),
-        RecordContent::Confirmation(device, value) => person_words(*device, value),
-        RecordContent::Step(device, value) => step_words(*device, value),
-        RecordContent::Remarks(device, remarks) => Some(format!("{device}: {}", remarks.join("; "))),
-        RecordContent::Remark(remark) => Some(remark.clone()),
-        RecordContent::Pass(value) => pass_words(value),
-        RecordContent::Transfer(value) => transfer_words(value),
-        RecordContent::File(value) => artefact_words(value),
-        RecordContent::Seal(value) => seal_words(value),
-        RecordContent::End(ending, _) => Some(ending_words(ending)),
-        RecordContent::Home(home) => Some(home_words(*home)),
-        RecordContent::Unknown => None,
+fn content_words(content: &Content) -> Option<String> {
+    match content {
+        Content::Begin(begin) => begin_words(begin),
+        Content::Reopen(_) => Some("reopened".to_owned()),
+        Content::Command(record) => Some(command_words(&record.command)),
+        Content::Event(record) => Some(event_words(&record.event)),
+        Content::Answer(Answer::Event { event }) => Some(format!("answered: {}", event.replace('_', " "))),
+        Content::Answer(Answer::Found { found }) => Some(format!("answered: {found}")),
+        Content::Confirmation(confirmation) => Some(confirmation_words(confirmation)),
+        Content::Recovery(RecoveryOrder { recover, device, seen }) => {
+            let seen = seen.as_deref().unwrap_or("unknown");
+            Some(format!("{device}: order {recover} to recover the machine; state before the order: {seen}"))
+        }
+        Content::MachineNotes(MachineNotes { device, notes }) => Some(format!("{device}: {}", notes.join("; "))),
+        Content::Remark(Remark { remark }) => Some(remark.clone()),
+        Content::Pass(pass) => Some(pass_words(&pass.pass_record)),
+        Content::Transfer(note) => Some(transfer_words(&note.transfer)),
+        Content::Artefact(Artefact { name, bytes, sha256 }) => {
+            Some(format!("{name}, {bytes} bytes, sha256 {}...", sha256.get(..12).unwrap_or(sha256)))
+        }
+        Content::Seal(Seal { records, key, .. }) => {
+            let key = key.get(..12).unwrap_or(key);
+            Some(format!("the records up to record {records} are sealed with key {key}..."))
+        }
+        Content::End(end) => match &end.ending {
+            RunEnd::Part(PartEnd { ending, .. }) | RunEnd::Bare(ending) => Some(ending_words(ending)),
+            RunEnd::Recovery(end) => Some(home_words([end.cmm_home, end.grinder_home])),
+            RunEnd::Other(_) => None,
+        },
+        Content::Unknown(_) => None,
     }
 }
 
-fn begin_words(value: &Value) -> Option<String> {
-    let marked = if value["simulation"] == true { "SIMULATION  " } else { "" };
-    let mut line = format!("{marked}run {}", value["run"].as_str()?);
-    for key in ["part_name", "recipe", "cell"] {
-        if let Some(text) = value["content"][key].as_str() {
-            let _ = write!(line, ", {text}");
-        }
+fn begin_words(begin: &Begin<RunContent>) -> Option<String> {
+    let marked = if begin.simulation == Some(true) { "SIMULATION  " } else { "" };
+    let mut line = format!("{marked}run {}", begin.run.as_ref()?);
+    for text in begin.content.names().into_iter().flatten() {
+        let _ = write!(line, ", {text}");
     }
     Some(line)
 }
 
-fn artefact_words(value: &Value) -> Option<String> {
-    let sha256 = value["sha256"].as_str()?;
-    let head = sha256.get(..12).unwrap_or(sha256);
-    Some(format!("{}, {} bytes, sha256 {head}...", value["name"].as_str()?, value["bytes"]))
-}
-
-fn seal_words(value: &Value) -> Option<String> {
-    let key = value["key"].as_str()?;
-    Some(format!(
-        "the records up to record {} are sealed with key {}...",
-        value["records"],
-        key.get(..12).unwrap_or(key)
-    ))
-}
-
-/// Returns one line about a record in which a person confirmed the state of a machine. The line contains the machine
-/// and the confirmed state. The names of the map and of the file follow if the record contains them. `value` is the
-/// content of the record. Returns `None` if `value` contains no confirmed state.
-fn person_words(device: Device, value: &Value) -> Option<String> {
-    let mut line = format!("{device}: {}", value["confirmed"].as_str()?);
-    for key in ["map", "file"] {
-        if let Some(text) = value[key].as_str() {
+/// Returns one line about the confirmation of a person: the machine and the confirmed state. The digits of the map and
+/// the path of the file follow if the person gave them.
+fn confirmation_words(confirmation: &Confirmation) -> String {
+    let (device, state, map, file) = confirmation.parts();
+    let mut line = format!("{device}: {state}");
+    for (key, text) in [("map", map), ("file", file)] {
+        if let Some(text) = text {
             let _ = write!(line, ", {key} {text}");
         }
     }
-    Some(line)
-}
-
-fn step_words(device: Device, value: &Value) -> Option<String> {
-    let (step, seen) = (value["recover"].as_str()?, value["seen"].as_str().unwrap_or("unknown"));
-    Some(format!("{device}: order {step} to recover the machine; state before the order: {seen}"))
+    line
 }
 
 /// Returns a text that says for each machine if it is home, such as "CMM home, grinder not home". A machine is home if
@@ -109,38 +101,34 @@ pub fn in_air(share: f64) -> String {
 }
 
 /// Returns one line with the values that the grinder reported about a pass, such as path length and removed volume.
-/// `value` is the content of the record. The line omits each value that the record does not contain. If the record
-/// contains none of the values, the line is "pass: no details reported". The result is always `Some`. It is an `Option`
-/// only because the functions for other records return one.
-fn pass_words(value: &Value) -> Option<String> {
-    let number = |key: &str| value[key].as_f64();
+/// The line omits each value that the grinder did not report. If there is none, the line is "pass: no details
+/// reported".
+fn pass_words(pass: &PassFigures) -> String {
     let told = [
-        number("path_mm").map(|mm| format!("path {mm:.0$} mm", usize::from(mm < 100.0))),
-        number("removed_mm3").map(|mm3| format!("{mm3:.1} mm³ removed")),
-        number("deepest_mm").map(|mm| format!("largest depth {:.1} µm", 1e3 * mm)),
-        number("idle_share").map(|share| format!("{:.0} % of the path in air", 1e2 * share)),
-        number("spindle_load").map(|share| format!("spindle load {:.0} %", 1e2 * share)),
-        number("wheel_radius_mm").map(|mm| format!("wheel radius {mm:.4} mm")),
-        number("temperature_c").map(|c| format!("{c:.1} °C")),
-        number("duration_s").map(|s| format!("{s:.0} s")),
+        pass.path_mm.map(|mm| format!("path {mm:.0$} mm", usize::from(mm < 100.0))),
+        pass.removed_mm3.map(|mm3| format!("{mm3:.1} mm³ removed")),
+        pass.max_depth_mm.map(|mm| format!("largest depth {:.1} µm", 1e3 * mm)),
+        pass.idle_share.map(|share| format!("{:.0} % of the path in air", 1e2 * share)),
+        pass.spindle_load.map(|share| format!("spindle load {:.0} %", 1e2 * share)),
+        pass.wheel_radius_mm.map(|mm| format!("wheel radius {mm:.4} mm")),
+        pass.temperature_c.map(|c| format!("{c:.1} °C")),
+        pass.duration_s.map(|s| format!("{s:.0} s")),
     ];
     let told: Vec<String> = told.into_iter().flatten().collect();
-    if told.is_empty() { Some("pass: no details reported".into()) } else { Some(format!("pass: {}", told.join(", "))) }
+    if told.is_empty() { "pass: no details reported".into() } else { format!("pass: {}", told.join(", ")) }
 }
 
-fn transfer_words(value: &Value) -> Option<String> {
-    let (points, seconds) = (value["points"].as_u64()?, value["seconds"].as_f64()?);
-    let mut line = format!("{points} points fetched in {seconds:.2} s");
-    if let Some(ms) = value["ms_per_point"].as_f64() {
+fn transfer_words(transfer: &Transfer) -> String {
+    let mut line = format!("{} points fetched in {:.2} s", transfer.points, transfer.seconds);
+    if let Some(ms) = transfer.ms_per_point {
         let _ = write!(line, ", {ms:.3} ms per point");
     }
-    match value["coordinates"].as_str() {
-        Some("centres") => line += ", probe centres",
-        Some("contacts") => line += ", contact points",
-        Some(other) => line = format!("{line}, {other}"),
+    match transfer.coordinates {
+        Some(Coordinates::Centres) => line += ", probe centres",
+        Some(Coordinates::Contacts) => line += ", contact points",
         None => {}
     }
-    Some(line)
+    line
 }
 
 /// Returns in one line how a run ended, with the reason: accepted, not accepted, stopped or aborted.

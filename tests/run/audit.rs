@@ -120,7 +120,7 @@ fn recorded(simulation: bool) -> (TempDir, PathBuf) {
         .close(
             50,
             2,
-            json!({ "simulation": simulation, "ending": ending, "cycles": [{ "cycle": 1, "level_um": 12.5 }] }),
+            json!({ "simulation": simulation, "ending": ending, "cycles": [{ "cycle": 1, "pv_um": 1.5, "rms_um": 0.5, "points": 9, "outliers": 0, "level_um": 12.5 }] }),
         )
         .unwrap();
     (home, folder)

@@ -70,6 +70,7 @@ pub fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
 
 /// Checks that the record is complete and contains every file, and that no START was accepted twice.
 fn is_whole(folder: &Path, seed: u64) {
+    crate::contents::assert_known(folder);
     let verified = verify(folder).unwrap();
     assert!(
         verified.closed && verified.unrecorded.iter().all(|name| name == "report.html"),
@@ -247,6 +248,7 @@ async fn recover_clears_machines_stepwise() {
         let (code, said) = recover(&home, "");
         assert!(code == 0 && said.matches("IDLE").count() == 2, "{said}");
         for folder in run_folders(&home.join("runs")) {
+            crate::contents::assert_known(&folder);
             let verified = verify(folder).unwrap();
             assert!(verified.closed && verified.open_intents.is_empty(), "{verified:?}");
         }

@@ -8,6 +8,7 @@ mod apart;
 mod audit;
 mod bad_cells;
 mod careful;
+mod contents;
 mod convergence;
 mod cycles;
 #[path = "../common/data.rs"]

@@ -254,6 +254,7 @@ fn manual_part_with_recorded_steps() {
     println!("{}", program.output_lines.join("\n"));
     assert!(cycle > 2 && said[0] == "confirm loaded", "{said:?}");
 
+    crate::contents::assert_known(&folder);
     // The record contains the person and the time of each step.
     let reader = Reader::open(&folder).unwrap();
     let records: Vec<Record> = reader.records(1).map(Result::unwrap).collect();

@@ -4,6 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use crate::contents;
 use crate::rig::{PATIENCE, Ready, Rig, event, small, until};
 use crate::sample::cases;
 use regrind::cell::{CellPlan, HoldOrStop};
@@ -25,6 +26,7 @@ async fn finished() -> (Rig, PathBuf) {
     orders.send(Request::Resume { reason: "tea is over".into(), state_number: None }, actor).await;
     tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(verify(&folder).unwrap().closed);
+    contents::assert_known(&folder);
     (rig, folder)
 }
 

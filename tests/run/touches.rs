@@ -57,6 +57,7 @@ fn adaptive_part_with_sixth_of_touches() {
         is_true(&ran, recipe);
         let verified = verify(&ran.folder).unwrap();
         assert!(verified.closed && verified.unrecorded.is_empty(), "{verified:?}");
+        crate::contents::assert_known(&ran.folder);
     }
 }
 
