@@ -71,6 +71,23 @@ pub enum JobStep {
     Discard,
 }
 
+impl fmt::Display for JobStep {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Send => "Send",
+            Self::Clear => "Clear",
+            Self::Prepare => "Prepare",
+            Self::Start => "Start",
+            Self::Run => "Run",
+            Self::Reconcile => "Reconcile",
+            Self::Collect => "Collect",
+            Self::Qualify => "Qualify",
+            Self::Acknowledge => "Acknowledge",
+            Self::Discard => "Discard",
+        })
+    }
+}
+
 /// Phase of a cycle. [`super::Cell::cycle`] has the number of the cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -171,7 +188,7 @@ impl Phase {
 impl fmt::Display for Phase {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.job() {
-            Some((_, step)) => write!(f, "{}, {step:?}", self.name()),
+            Some((_, step)) => write!(f, "{}, {step}", self.name()),
             None => f.write_str(self.name()),
         }
     }

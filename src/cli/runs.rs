@@ -117,7 +117,7 @@ fn as_json(run: &Listed) -> Value {
         .collect();
     json!({
         "folder": run.folder, "run": id, "live": run.is_live, "part": part, "part_name": name, "recipe": recipe, "operator": operator,
-        "began": began, "ended": ended, "simulation": simulation, "result": format!("{result:?}"), "words": verdict,
+        "began": began, "ended": ended, "simulation": simulation, "result": result.name(), "words": verdict,
         "alarms": alarms.len(), "cycles": cycles,
     })
 }

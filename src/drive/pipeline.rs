@@ -616,11 +616,8 @@ fn write_registration(
     found: &Registration,
     options: &RegistrationOptions,
 ) -> Result<(), FormatError> {
-    let nominal = NominalInput {
-        file: &task.nominal_path,
-        points: task.nominal.len(),
-        kind: format!("{:?}", task.nominal.kind()),
-    };
+    let nominal =
+        NominalInput { file: &task.nominal_path, points: task.nominal.len(), kind: task.nominal.kind().to_string() };
     let mut document = RegistrationDocument::new(found, options, nominal, Path::new("measured.csv"));
     document.simulation = Some(task.simulation);
     for name in ["deviations.csv", "deviation_uncertainty.csv", "registration.json"] {

@@ -528,7 +528,7 @@ impl RunFilter {
         let has = |value: &str, wanted: &str| {
             wanted.is_empty() || value.to_lowercase().contains(&wanted.trim().to_lowercase())
         };
-        let result = self.result.is_empty() || self.result == format!("{:?}", run.summary.result);
+        let result = self.result.is_empty() || self.result == run.summary.result.name();
         let day = run.summary.began.get(..10).unwrap_or_default();
         let in_time =
             (self.since.is_empty() || day >= self.since.trim()) && (self.until.is_empty() || day <= self.until.trim());
@@ -561,7 +561,7 @@ pub(crate) async fn runs(
                     select name="result" {
                         option value="" { (say(Text::All)) }
                         @for result in RESULTS {
-                            @let name = format!("{result:?}");
+                            @let name = result.name();
                             option value=(name) selected[name == wanted.result] { (say(texts::result(result))) }
                         }
                     }

@@ -68,6 +68,20 @@ pub enum RunResult {
     Recovery,
 }
 
+impl RunResult {
+    /// Returns the name of the result in files and in addresses of the page, such as "NotAccepted".
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Open => "Open",
+            Self::Accepted => "Accepted",
+            Self::NotAccepted => "NotAccepted",
+            Self::Stopped => "Stopped",
+            Self::Aborted => "Aborted",
+            Self::Recovery => "Recovery",
+        }
+    }
+}
+
 /// Summary of a cycle. Units: micrometres.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CycleSummary {

@@ -2,6 +2,8 @@
 
 use std::fmt::Write;
 
+use serde::Serialize;
+
 use regrind_cell::{
     Alarm, Command, CompensationRefusal, ConnectionRefusal, Device, Ending, Event, Figures, GateFailure, GateResult,
     Judgement, Occupation, Reconciliation, RecordFailure, RecordedInterval, Role,
@@ -159,6 +161,12 @@ fn spaced(name: &str) -> String {
     words
 }
 
+/// Returns the name with which `value` is recorded, as lower-case words. `value` is of a type that is recorded as a name,
+/// such as a verdict.
+fn recorded_name(value: &impl Serialize) -> String {
+    serde_json::to_value(value).ok().as_ref().and_then(|name| name.as_str()).map(spaced).unwrap_or_default()
+}
+
 /// Returns the identifier `name` of a command or an event as lower-case words. If `device` is given, the name of this
 /// machine comes first, such as "CMM: load confirmed".
 fn named(name: &str, device: Option<Device>) -> String {
@@ -172,7 +180,7 @@ pub(super) fn judgement_words(judgement: &Judgement) -> String {
 
 /// Returns the verdict of a judgement as lower-case words, such as "wrong response".
 pub(super) fn verdict_words(judgement: &Judgement) -> String {
-    spaced(&format!("{:?}", judgement.verdict))
+    recorded_name(&judgement.verdict)
 }
 
 /// Returns in one line the cause of an alarm, its consequence, and what to do.
@@ -185,7 +193,7 @@ pub(super) fn alarm_words(alarm: &Alarm) -> String {
 pub(super) fn role_words(alarm: &Alarm) -> String {
     match alarm.cleared_by {
         Role::Nobody => "itself".to_owned(),
-        role => spaced(&format!("{role:?}")),
+        role => recorded_name(&role),
     }
 }
 
@@ -193,7 +201,7 @@ fn command_words(command: &Command) -> String {
     match command {
         Command::Announce(judgement) => judgement_words(judgement),
         Command::Raise(alarm) => format!("ALARM {} {}", alarm.event, alarm.consequence),
-        Command::Withdraw { alarm } => format!("alarm withdrawn: {}", spaced(&format!("{alarm:?}"))),
+        Command::Withdraw { alarm } => format!("alarm withdrawn: {}", recorded_name(alarm)),
         Command::Refuse { event, state, reason } => format!("{} refused in {state}: {reason}", spaced(event.name())),
         Command::Finish(ending) => format!("finish, {}", ending_words(ending)),
         command => {
@@ -224,7 +232,7 @@ fn event_words(event: &Event) -> String {
         Event::Progressed { done, total, .. } => format!("{done} of {total}"),
         Event::Ended { result, .. } => result.to_string(),
         Event::Obstructed { message, .. } => message.clone(),
-        Event::Refused { request, reason, .. } => format!("{}: {reason}", spaced(&format!("{request:?}"))),
+        Event::Refused { request, reason, .. } => format!("{}: {reason}", recorded_name(request)),
         Event::Fault { code, message, .. } => format!("{code}, {message}"),
         Event::Reconciled { outcome, .. } => reconciliation_words(outcome),
         Event::Collected { targets, found, gate, .. } => {

@@ -1,5 +1,6 @@
 //! Nominal surface, created from points, a grid, a mesh or several patches, with its properties.
 
+use std::fmt;
 use std::sync::OnceLock;
 
 use rayon::prelude::*;
@@ -55,6 +56,26 @@ pub enum NominalKind {
         /// Number of patches.
         count: usize,
     },
+}
+
+impl fmt::Display for NominalKind {
+    /// Writes the kind as `registration.json` has it. Replays compare this text with the recorded one.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Grid { columns, rows } => write!(f, "Grid {{ columns: {columns}, rows: {rows} }}"),
+            Self::Scattered { projection } => {
+                let projection = match projection {
+                    PlaneProjection::Auto => "Auto",
+                    PlaneProjection::Xy => "Xy",
+                    PlaneProjection::BestFit => "BestFit",
+                    PlaneProjection::Spherical => "Spherical",
+                };
+                write!(f, "Scattered {{ projection: {projection} }}")
+            }
+            Self::Mesh => f.write_str("Mesh"),
+            Self::Patches { count } => write!(f, "Patches {{ count: {count} }}"),
+        }
+    }
 }
 
 impl Nominal {

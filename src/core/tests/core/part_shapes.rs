@@ -340,3 +340,19 @@ fn subtracted_radius_errs_by_micrometres() {
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), e| (l.min(e), h.max(e)));
     assert!(high - low > 1e-3, "PV of the difference {} mm", high - low);
 }
+
+#[test]
+fn kinds_have_recorded_names() {
+    let scattered = |projection| NominalKind::Scattered { projection };
+    for (kind, name) in [
+        (NominalKind::Grid { columns: 60, rows: 30 }, "Grid { columns: 60, rows: 30 }"),
+        (scattered(PlaneProjection::Auto), "Scattered { projection: Auto }"),
+        (scattered(PlaneProjection::Xy), "Scattered { projection: Xy }"),
+        (scattered(PlaneProjection::BestFit), "Scattered { projection: BestFit }"),
+        (scattered(PlaneProjection::Spherical), "Scattered { projection: Spherical }"),
+        (NominalKind::Mesh, "Mesh"),
+        (NominalKind::Patches { count: 3 }, "Patches { count: 3 }"),
+    ] {
+        assert_eq!(kind.to_string(), name);
+    }
+}
