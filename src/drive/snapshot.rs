@@ -11,25 +11,25 @@ impl Drive {
     pub(super) fn snapshot(&self) -> Snapshot {
         let state = self.cell.state();
         let waits_for: Vec<String> = match state.phase().and_then(Phase::job) {
-            Some((device, _)) => self.notes[device as usize].clone(),
+            Some((device, _)) => self.machines.notes[device as usize].clone(),
             None => Vec::new(),
         };
         let next_step = next_step(&self.cell, &waits_for);
         Snapshot {
             simulation: self.task.simulation,
             part: self.task.part.clone(),
-            serial: self.serial.clone(),
+            serial: self.context.serial.clone(),
             state: state.name(),
             phase: state.phase(),
             unconfirmed: self.cell.unconfirmed(),
             message: self.cell.in_words(),
             verdict: PartVerdict::from_state(state.name()),
-            state_number: self.state_changes,
+            state_number: self.display.state_changes,
             cycle: self.cell.cycle(),
             max_cycles: self.cell.plan().max_cycles,
             elapsed_s: self.now().as_secs_f64(),
-            progress: self.progress_estimator.progress(),
-            preview: self.preview_statistics.statistics(),
+            progress: self.display.progress_estimator.progress(),
+            preview: self.display.preview_statistics.statistics(),
             tolerance: Some(self.cell.plan().tolerance),
             cycles: self.cycles.rows(&self.cell.plan().tolerance),
             alarms: self.cell.alarms().cloned().collect(),

@@ -15,16 +15,16 @@ OTHER_WIRES = 1_000_000
 
 GUARDS = {
     "START waits for its record": (
-        "src/drive/mod.rs", "        Command::HoldMachine { .. }\n", "        Command::StartMachine { .. } | Command::HoldMachine { .. }\n"),
+        "src/drive/record_queue.rs", "        Command::HoldMachine { .. }\n", "        Command::StartMachine { .. } | Command::HoldMachine { .. }\n"),
     "what has waited is asked of the cell once more": (
-        "src/drive/mod.rs", "RecordAction::Execute(command) if self.cell.still_requires(&command) =>", "RecordAction::Execute(command) if true || self.cell.still_requires(&command) =>"),
+        "src/drive/recording.rs", "RecordAction::Execute(command) if self.cell.still_requires(&command) =>", "RecordAction::Execute(command) if true || self.cell.still_requires(&command) =>"),
     "an order is answered when it is on record": (
-        "src/drive/mod.rs", "self.backlog.push_back(PendingRecord {\n                receipt: ticket,\n                action: RecordAction::Answer { answer, accepted, message },\n            });",
+        "src/drive/orders.rs", "self.record.queue(ticket, RecordAction::Answer { answer, accepted, message });",
         "drop((ticket, answer.send(Reply { accepted, message, status: self.snapshot() })));"),
     "an abort gives up what the machine is asked": (
         "src/drive/station.rs", "() = aborts.wait_for_abort() => {}", "() = std::future::pending() => {}"),
     "an abort waits for no record": (
-        "src/drive/mod.rs", "            | Command::AbortMachine { .. }\n            | Command::VerifyClear", "            | Command::VerifyClear"),
+        "src/drive/record_queue.rs", "            | Command::AbortMachine { .. }\n            | Command::VerifyClear", "            | Command::VerifyClear"),
     "a START without an answer is unknown": (
         "src/drive/station.rs", "self.report(Event::StartUnknown { device: B::DEVICE, cycle, reason: error.to_string() }).await;",
         "self.observed.running = false; self.report_failure(MachineRequest::Start, error).await;"),
@@ -62,7 +62,7 @@ GUARDS = {
     "what was seen to begin has begun, whatever the machine says": (
         "src/cell/transitions.rs", "(Reconciliation::NotStarted, _) if self.job_observed[device as usize] => {", "(Reconciliation::NotStarted, _) if self.job_observed[device as usize] && false => {"),
     "what has not come on record is withdrawn while the disk is full": (
-        "src/drive/mod.rs", "        if self.record_failure_reason.is_none() || self.ending.is_some() {\n", "        if true {\n"),
+        "src/drive/recording.rs", "        if self.record.failure_reason.is_none() || self.ending.is_some() {\n", "        if true {\n"),
     "an abort of a lost I++ connection is given anew": (
         "src/device/ippdme/machine.rs", "saturating_sub(u64::from(state == MachineState::Aborting))", "saturating_sub(u64::from(state == MachineState::Aborting && false))",
         "device", "abort_is_first_after_reconnect"),
