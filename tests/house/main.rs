@@ -4,6 +4,7 @@
 
 mod circles;
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -405,4 +406,30 @@ fn circles_found_through_reexports() {
     let root = ("house/lib.rs", "mod a;\nuse a::First;\npub const fn root(_: First) {}\n");
     let child = ("house/a.rs", "pub struct First;\nfn child() {\n    crate::root(First)\n}\n");
     assert_eq!(found(&[root, child]).len(), 1);
+}
+
+/// Returns the names of the test binaries of the workspace: each file or folder with `main.rs` in a folder `tests` of a
+/// crate.
+fn test_binaries() -> BTreeSet<String> {
+    let mut crates = vec![root().to_owned(), root().join("sim")];
+    crates.extend(fs::read_dir(root().join("src")).unwrap().map(|entry| entry.unwrap().path()));
+    let crates = crates.into_iter().filter(|folder| folder.join("Cargo.toml").is_file());
+    let tests = crates.flat_map(|folder| fs::read_dir(folder.join("tests")).into_iter().flatten());
+    let is_binary = |path: &PathBuf| path.join("main.rs").is_file() || path.extension().is_some_and(|e| e == "rs");
+    let name = |path: PathBuf| path.file_stem().unwrap().to_string_lossy().into_owned();
+    tests.map(|entry| entry.unwrap().path()).filter(is_binary).map(name).collect()
+}
+
+#[test]
+fn ci_runs_every_test_binary_once() {
+    let script = fs::read_to_string(root().join(".ci/run")).unwrap();
+    let lists = ["computing=(", "waiting=("].map(|begin| {
+        let list = &script[script.find(begin).expect(begin)..];
+        list[..list.find(')').unwrap()].to_owned()
+    });
+    let named = lists.iter().flat_map(|list| list.split("--test ").skip(1));
+    let named: Vec<&str> = named.map(|rest| rest.split_whitespace().next().unwrap()).collect();
+    let all: BTreeSet<String> = named.iter().map(|name| (*name).to_owned()).collect();
+    assert_eq!(all, test_binaries());
+    assert_eq!(all.len(), named.len(), "a binary is in both lists: {named:?}");
 }
