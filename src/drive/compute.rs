@@ -7,6 +7,7 @@ use tokio::task::JoinError;
 use super::Drive;
 use super::Task;
 use super::computation::{Computation, batch_folder, create_folder, cycle_folder};
+use super::evaluation;
 use super::failure::{failure_message, panic_message};
 use super::notice::Notice;
 use super::pipeline;
@@ -38,7 +39,7 @@ impl Drive {
         let Some(cycle) = self.cycles.get(number).cloned() else { return };
         let before = self.cycles.previous_judged(number).cloned();
         self.start_computation(Computation::Registration, number, move |task, files| {
-            pipeline::register_cycle(task, files, number, &cycle, before.as_ref())
+            evaluation::register_cycle(task, files, number, &cycle, before.as_ref())
         });
     }
 

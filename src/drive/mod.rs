@@ -20,6 +20,7 @@ mod compute;
 mod cycle_output;
 mod cycles;
 mod display;
+mod evaluation;
 mod execute;
 mod failure;
 mod machine_reports;

@@ -5,14 +5,13 @@
 
 use std::borrow::Cow;
 use std::collections::HashSet;
-use std::path::Path;
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
 use crate::cell::{
-    CompensationRefusal, CompensationSummary, Event, Figures, Forecast, FurtherTouches, GateFailure, GateResult,
-    OutlierFigures, PartResponse, RecordedFormFigures, RecordedInterval, RecordedParameter,
+    CompensationRefusal, CompensationSummary, Event, Figures, Forecast, GateFailure, GateResult, OutlierFigures,
+    PartResponse, RecordedFormFigures, RecordedInterval, RecordedParameter,
 };
 use crate::compensation::{
     self, Correction, ErrorMap, LearningState, NextPassError, PassObservation, ResponseKind, error_map,
@@ -20,21 +19,17 @@ use crate::compensation::{
 };
 use crate::device::{Coordinates, Identified, MeasuredPoint, Measurement, Plan, PlanMismatch, TargetKind, TouchStatus};
 use crate::form::pv_998;
-use crate::formats::{
-    FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_form, save_registration,
-    write_json_atomic, write_points,
-};
+use crate::formats::{FormatError, Learned, ResultFolder, write_json_atomic, write_points};
 use crate::geometry::{Point, Vector};
 use crate::measuring::fit_sphere;
-use crate::model::{self, Form, ModelInputs, PartFit, PartPriors, Prior};
-use crate::registration::{PointStatus as Fate, Registration, RegistrationOptions, RegistrationQuality, map_obstacle};
+use crate::model::{self, Form, PartPriors};
+use crate::registration::{PointStatus as Fate, Registration, RegistrationQuality, map_obstacle};
 
-use super::adaptive_measurement;
 use super::cycle_output;
 use super::recorder::{ComputationError, OutputFiles, classify_error};
 use super::task::{
-    ComputationProduct, ControlPoint, CycleState, RegistrationProduct, RepeatedTouches, Task, UsablePoints,
-    deviation_samples, used_deviations,
+    ComputationProduct, ControlPoint, CycleState, RepeatedTouches, Task, UsablePoints, deviation_samples,
+    used_deviations,
 };
 
 /// Checks whether the measurement of cycle `number` can be used (this check is the gate). If it can, writes its points
@@ -410,193 +405,11 @@ fn fit_probe_radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 3]>, G
     Ok(Some([found, fit.radius_sigma_mm, fit.rms_mm]))
 }
 
-/// Registers the points of cycle `number`, computes the form figures and the error map, and writes these results to
-/// `files`. `before` is the last judged cycle of an earlier pass. Returns the event for the cell and the results. If
-/// the registration fails or cannot be saved, the event states the reason, and there are no results.
-pub(super) fn register_cycle(
-    task: &Task,
-    files: &mut OutputFiles,
-    number: u32,
-    cycle: &CycleState,
-    before: Option<&CycleState>,
-) -> (Event, ComputationProduct) {
-    match register_and_evaluate(task, files, number, cycle, before) {
-        Ok(found) => {
-            let event = Event::Registered { cycle: number, figures: found.figures.clone() };
-            (event, ComputationProduct::Registered(Box::new(found)))
-        }
-        Err(ComputationError::Failed(reason)) => {
-            (Event::RegistrationFailed { cycle: number, reason }, ComputationProduct::Nothing)
-        }
-        Err(ComputationError::NotSaved(reason)) => {
-            (Event::NotSaved { cycle: number, reason }, ComputationProduct::Nothing)
-        }
-    }
-}
-
-fn register_and_evaluate(
-    task: &Task,
-    files: &mut OutputFiles,
-    number: u32,
-    cycle: &CycleState,
-    before: Option<&CycleState>,
-) -> Result<RegistrationProduct, ComputationError<String>> {
-    let none = || ComputationError::Failed("this cycle has no points".to_owned());
-    let points = cycle.points.as_ref().ok_or_else(none)?;
-    // The target surface of this pass is above the nominal one by its level, and the ball rolls on it.
-    let radius_mm = points.probe_radius_mm.unwrap_or(task.probing.probe_radius_mm);
-    let ball_mm = if points.coordinates == Coordinates::Contacts { 0.0 } else { radius_mm };
-    let grown = task.expansion.as_ref().zip(points.temperature_c);
-    let (ball_mm, part, scale_sigma) = match grown {
-        Some((expansion, told_c)) => {
-            let part = Cow::Owned(expansion.at_reference(&points.part, told_c));
-            (ball_mm / expansion.length_factor(told_c), part, expansion.length_factor_sigma(told_c))
-        }
-        None => (ball_mm, Cow::Borrowed(&points.part), 0.0),
-    };
-    let probe_radius_mm = (ball_mm + cycle.correction.level_mm).max(0.0);
-    // The first few touches show only if the right part is in the right place. A search on them would be a guess.
-    let at_fixture = task.start_at_fixture || points.tried_targets.len() == 1;
-    let (mut found, options) = task.register_with_start(&part, probe_radius_mm, at_fixture).map_err(classify_error)?;
-    if let Some(reason) = found.unjudgeable_reason() {
-        return Err(ComputationError::Failed(reason));
-    }
-    found.add_radius_uncertainty(points.probe_radius_sigma_mm.hypot(task.machine_uncertainty.reference_sphere_mm));
-    let given = ModelInputs {
-        machine: task.machine_uncertainty,
-        prior: field_prior(task, cycle, before),
-        radius_sigma_mm: points.probe_radius_sigma_mm,
-        scale_sigma,
-        locked_sigmas: task.locked_direction_sigmas(),
-        is_corrected: !cycle.correction.is_zero(),
-        probe_noise_mm: points.probe_noise_mm,
-        area: cycle_output::area_options(task),
-        ..ModelInputs::default()
-    };
-    let looked = task.adaptive.as_ref().filter(|_| !points.tried_targets.is_empty());
-    let looked_at = looked.is_some();
-    let looked = looked.map(|adaptive| {
-        adaptive_measurement::evaluate_touches(task, adaptive, (number, cycle), points, (&found, given))
-    });
-    let (form, next) = match looked {
-        Some(adaptive_measurement::TouchEvaluation { form, next }) => (form, next),
-        None => (Form::estimate(&found, &given).map_err(|error| error.to_string()), None),
-    };
-    if looked_at && next.is_none() {
-        files
-            .switch_to_final_subfolder()
-            .and_then(|()| write_measured_points(task, files, points))
-            .map_err(classify_error)?;
-    }
-    write_registration(task, files, &found, &options).map_err(classify_error)?;
-    if let Ok(form) = &form {
-        for name in ["form.csv", "model.json"] {
-            files.add_file(name);
-        }
-        save_form(&files.folder(), form, &found, Some(task.simulation)).map_err(classify_error)?;
-    }
-    // If touches were chosen, the map is the estimated form between them. Otherwise it is the filtered deviations.
-    let error = match &form {
-        Ok(form) if looked_at => adaptive_measurement::interpolate_form(task, form),
-        Err(_) if looked_at => None,
-        _ => error_map(&deviation_samples(&found), &task.map_options).ok(),
-    };
-    cycle_output::save_figures(task, files, error.as_ref(), &found, form.as_ref().ok()).map_err(classify_error)?;
-    let contacts = cycle_output::surface_points(&found);
-    let told = cycle_output::save_parameters(task, files, cycle, &contacts).map_err(classify_error)?;
-    // Every measurement leaves its map, whatever happens to the correction.
-    error.as_ref().map_or(Ok(()), |map| cycle_output::save_error_map(task, files, (number, cycle), map, &found))?;
-    let answer = error.as_ref().and_then(|error| part_response(before?, cycle, &found, error));
-    // Only the first pass of a run reveals parameters of the machine. Later changes are wear and drift, which the
-    // learning covers.
-    let parameters = told.filter(|_| before.is_none());
-    let offered: Vec<String> = parameters.iter().flat_map(offered_messages).collect();
-    let set = match &parameters {
-        Some(told) => cycle_output::next_parameter_corrections(task, cycle, &contacts, told),
-        None => cycle.correction.parameters.clone(),
-    };
-    let known = error.as_ref().map(|error| update_learning(task, cycle, before, error, (answer, &contacts)));
-    let forecast =
-        known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error, task.scallops_rms_mm()));
-    let mut figures = cell_figures(task, cycle, &found, form.as_ref().ok(), error.as_ref(), answer, forecast);
-    figures.warnings.extend(error.iter().flat_map(|map| map.advice.iter().cloned()).chain(offered));
-    if task.expansion.is_some() && grown.is_none() {
-        let message = "the measurement has no temperature, so the thermal expansion of the part is not compensated (part.expansion_um_m_k)";
-        figures.warnings.push(message.to_owned());
-    }
-    let untold = |error: &String| {
-        format!(
-            "the form error of the part and the noise of the probe cannot be separated, so the stated uncertainty is too small: {error}"
-        )
-    };
-    if next.is_none() {
-        figures.warnings.extend(form.as_ref().err().map(untold));
-    }
-    figures.further_touches = next.as_ref().map(|(next, reason)| {
-        Box::new(FurtherTouches { target_count: next.len() as u32, reason: (*reason).to_owned() })
-    });
-    if next.is_some() && form.is_err() {
-        // The first few touches have six motions fitted: their residuals say nothing about the form.
-        figures.form = None;
-    }
-    let next = next.map(|(next, _)| next);
-    // Without a model, the residuals of the fit bound the noise from above.
-    let noise_sigma_mm =
-        form.as_ref().map_or(found.quality.residual_sigma_mm, |form| form.hyperparameters.noise_sigma_mm);
-    let again = if looked_at {
-        None
-    } else {
-        adaptive_measurement::plan_repeated_touches(task, &found, points, noise_sigma_mm)
-    };
-    if let Some(left_out) = figures.with_outliers.as_mut() {
-        left_out.can_repeat = again.is_some();
-    }
-    // Before a person is called, the machine checks the touches by repeating them.
-    let again = again.filter(|_| task.tolerance.outliers_decide(&figures));
-    if let Some(again) = again.as_ref().filter(|_| points.repeat_rounds == 0) {
-        let targets = again.targets.len() as u32;
-        let reason =
-            "a touch is an outlier, so this touch is repeated, with a few touches near the same place".to_owned();
-        figures.further_touches = Some(Box::new(FurtherTouches { target_count: targets, reason }));
-    }
-    let field = next.is_none().then(|| form.as_ref().ok()?.hyperparameters_without_prior).flatten();
-    Ok(RegistrationProduct {
-        registration: found,
-        form: form.ok(),
-        field_hyperparameters: field,
-        error_map: error,
-        learning: known,
-        parameters,
-        parameter_corrections: set,
-        figures,
-        next_targets: next,
-        repeated_touches: again,
-    })
-}
-
-/// Returns one message for people for each machine parameter, such as the wheel radius, whose error should be corrected
-/// at its cause. A parameter is included if its effect differs from all other effects in the fit, and if its estimated
-/// error is larger than the expanded uncertainty of this estimate.
-fn offered_messages(told: &compensation::ParameterEstimation) -> impl Iterator<Item = String> {
-    told.estimates.iter().filter(|p| p.is_offered).map(|p| p.message.clone())
-}
-
-/// Returns the prior of the error model for a cycle. A pass with a correction and a pass without one have different
-/// priors. The prior learned from earlier parts is preferred. Without one, the prior comes from the cycle `before`, if
-/// its pass is of the same kind. Returns `None` if neither gives a prior.
-fn field_prior(task: &Task, cycle: &CycleState, before: Option<&CycleState>) -> Option<Prior> {
-    let is_corrected = !cycle.correction.is_zero();
-    let taught = task.learned.as_ref().and_then(|learned| learned.fields.fit(is_corrected));
-    let alike = before.filter(|before| before.correction.is_zero() != is_corrected);
-    let of_this_part = || Some(PartFit::updated(None, &alike?.field_hyperparameters?));
-    taught.or_else(of_this_part).map(|lesson| lesson.prior())
-}
-
 /// Returns the state of the learning (the estimate of how the part responds to corrections) after a measured pass.
 /// Updates the state of `before`, the previous judged cycle. If `before` has none, updates the initial state of the
 /// run. `error` is the error map of this cycle. `answer` is the response of the part to the correction, if it was
 /// estimated. `contacts` are the measured points.
-fn update_learning(
+pub(super) fn update_learning(
     task: &Task,
     cycle: &CycleState,
     before: Option<&CycleState>,
@@ -610,23 +423,7 @@ fn update_learning(
     earlier.updated(&PassObservation { correction: &cycle.correction, error, response: answer, explained: smooth })
 }
 
-fn write_registration(
-    task: &Task,
-    files: &mut OutputFiles,
-    found: &Registration,
-    options: &RegistrationOptions,
-) -> Result<(), FormatError> {
-    let nominal =
-        NominalInput { file: &task.nominal_path, points: task.nominal.len(), kind: task.nominal.kind().to_string() };
-    let mut document = RegistrationDocument::new(found, options, nominal, Path::new("measured.csv"));
-    document.simulation = Some(task.simulation);
-    for name in ["deviations.csv", "deviation_uncertainty.csv", "registration.json"] {
-        files.add_file(name);
-    }
-    save_registration(&files.folder(), &document, &found.deviations)
-}
-
-fn cell_figures(
+pub(super) fn cell_figures(
     task: &Task,
     cycle: &CycleState,
     found: &Registration,
@@ -756,7 +553,7 @@ fn rms_without_noise(scatter_mm: f64, verdict: &RegistrationQuality) -> Recorded
     }
 }
 
-fn part_response(
+pub(super) fn part_response(
     before: &CycleState,
     cycle: &CycleState,
     found: &Registration,
@@ -953,7 +750,11 @@ pub(super) struct MeasurementConditions {
 ///
 /// # Errors
 /// A file cannot be written.
-fn write_measured_points(task: &Task, files: &mut OutputFiles, points: &UsablePoints) -> Result<(), FormatError> {
+pub(super) fn write_measured_points(
+    task: &Task,
+    files: &mut OutputFiles,
+    points: &UsablePoints,
+) -> Result<(), FormatError> {
     if let Some(temperature_c) = points.temperature_c.filter(|_| task.expansion.is_some()) {
         let conditions = MeasurementConditions { simulation: task.simulation, temperature_c };
         write_json_atomic(files.add_file(CONDITIONS_FILE), &conditions)?;

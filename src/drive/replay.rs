@@ -25,6 +25,7 @@ use super::Task;
 use super::comparison::{is_same_decision, is_same_file, is_same_result};
 use super::computation::{Computation, batch_folder, create_folder, cycle_folder};
 use super::cycles::Cycles;
+use super::evaluation;
 use super::pipeline;
 use super::recorder::OutputFiles;
 use super::station::prepared_job;
@@ -295,7 +296,7 @@ impl<'t> Replay<'t> {
         let mut files = OutputFiles::new(scratch.path().to_owned(), cycle_folder(number, 1));
         create_folder(&files.folder())?;
         let (again, product) = match kind {
-            Computation::Registration => pipeline::register_cycle(
+            Computation::Registration => evaluation::register_cycle(
                 self.task,
                 &mut files,
                 number,
