@@ -82,6 +82,7 @@ impl Results {
     pub(super) fn from_history(story: &RunHistory, head: String) -> Self {
         let start = &story.start;
         let text = |text: &Option<String>| text.clone().unwrap_or_default();
+        let [name, recipe, cell] = start.content.names();
         let part = start.content.part().cloned().unwrap_or_default();
         let of_begin = |field: fn(&Record) -> &String| story.begin.as_ref().map(field).cloned().unwrap_or_default();
         let tolerance = story.tolerance();
@@ -92,9 +93,9 @@ impl Results {
         Self {
             run: text(&start.run),
             part: of_begin(|begin| &begin.part),
-            name: text(&part.part_name),
-            recipe: [text(&part.recipe), text(&part.recipe_sha256)],
-            cell: [text(&part.cell), text(&part.cell_sha256)],
+            name: name.unwrap_or_default().to_owned(),
+            recipe: [recipe.unwrap_or_default().to_owned(), text(&part.recipe_sha256)],
+            cell: [cell.unwrap_or_default().to_owned(), text(&part.cell_sha256)],
             operator: of_begin(|begin| &begin.actor),
             station: of_begin(|begin| &begin.station),
             began: of_begin(|begin| &begin.utc),

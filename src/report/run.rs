@@ -221,15 +221,19 @@ fn decision_rule(tolerance: &Tolerance) -> String {
 
 fn facts(story: &RunHistory) -> String {
     let Some(first) = &story.begin else { return String::new() };
-    let part = story.start.content.part().cloned().unwrap_or_default();
-    let recorded = |text: Option<String>| text.unwrap_or_else(|| "not recorded".to_owned());
-    let source = |path, sha256| format!("{}, sha256 {}", recorded(path), recorded(sha256));
+    let [_, recipe, cell] = story.start.content.names();
+    let part = story.start.content.part();
+    let hashes = part.map_or([None, None], |part| [part.recipe_sha256.as_deref(), part.cell_sha256.as_deref()]);
+    let source = |texts: [Option<&str>; 2]| {
+        let [path, sha256] = texts.map(|text| text.unwrap_or("not recorded"));
+        format!("{path}, sha256 {sha256}")
+    };
     let ended = story.end.as_ref().map_or("not yet".to_owned(), |end| when(&end.utc));
     let facts = [
         ("Serial number", first.part.clone()),
         ("Run", story.start.run.clone().unwrap_or_default()),
-        ("Recipe", source(part.recipe, part.recipe_sha256)),
-        ("Cell", source(part.cell, part.cell_sha256)),
+        ("Recipe", source([recipe, hashes[0]])),
+        ("Cell", source([cell, hashes[1]])),
         ("Operator", format!("{} at {}", first.actor, first.station)),
         ("Began", when(&first.utc)),
         ("Ended", ended),

@@ -15,6 +15,7 @@ mod cycles;
 mod data;
 mod defects;
 mod dialects;
+mod earlier_records;
 mod faults;
 mod files;
 mod first_touches;
