@@ -4,6 +4,7 @@
 
 use std::collections::BTreeSet;
 
+use proptest::prelude::*;
 use regrind_cell::{Command, Device, Ending, Event, sample_events};
 use regrind_journal::{Record, RecordKind, canonical_json};
 use regrind_record::{
@@ -292,4 +293,66 @@ fn document_names_every_key() {
     assert!(keys.len() > 70, "{}", keys.len());
     let missing: Vec<&&str> = keys.iter().filter(|key| !kinds.contains(&format!("`{key}`"))).collect();
     assert!(missing.is_empty(), "docs/journal.md does not name {missing:?}");
+}
+
+/// Replaces the value at a place within `value`, or removes it if `with` is `None`. `way` chooses the place.
+fn damage(value: &mut Value, way: &[prop::sample::Index], with: Option<Value>) {
+    let (place, rest) = match way {
+        [place, rest @ ..] => (place, rest),
+        [] => return,
+    };
+    match value {
+        Value::Object(members) if !members.is_empty() => {
+            let key = members.keys().nth(place.index(members.len())).unwrap().clone();
+            match (rest, with) {
+                ([], Some(with)) => drop(members.insert(key, with)),
+                ([], None) => drop(members.remove(&key)),
+                (rest, with) => damage(members.get_mut(&key).unwrap(), rest, with),
+            }
+        }
+        Value::Array(items) if !items.is_empty() => {
+            let at = place.index(items.len());
+            damage(&mut items[at], rest, with);
+        }
+        _ => {}
+    }
+}
+
+/// Returns a value of any kind that a payload can have.
+fn any_value() -> impl Strategy<Value = Option<Value>> {
+    prop_oneof![
+        Just(None),
+        Just(Some(Value::Null)),
+        any::<bool>().prop_map(|value| Some(json!(value))),
+        any::<i64>().prop_map(|value| Some(json!(value))),
+        any::<f64>().prop_map(|value| Some(json!(value))),
+        "[a-z_]{0,12}".prop_map(|value| Some(json!(value))),
+        Just(Some(json!([]))),
+        Just(Some(json!({}))),
+        Just(Some(json!([[1, 2], { "a": null }]))),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 4000, failure_persistence: None, ..ProptestConfig::default() })]
+
+    /// A damaged payload is refused, or read to a content that is written and read again to the same payload.
+    #[test]
+    fn damaged_payloads_are_refused_or_stable(
+        which in any::<prop::sample::Index>(),
+        way in prop::collection::vec(any::<prop::sample::Index>(), 1..5),
+        with in any_value(),
+        as_kind in prop::option::weighted(0.1, 0..RecordKind::ALL.len()),
+    ) {
+        let samples: Vec<_> = payloads().collect();
+        let (kind, text) = samples[which.index(samples.len())];
+        let kind = as_kind.map_or(kind, |k| RecordKind::ALL[k]);
+        let mut value: Value = serde_json::from_str(text).unwrap();
+        damage(&mut value, &way, with);
+        let Ok(content) = Content::from_payload(kind, value) else { return Ok(()) };
+        let written = content.payload();
+        let again = Content::from_payload(kind, written.clone());
+        prop_assert!(again.is_ok(), "{written}");
+        prop_assert_eq!(again.unwrap().payload(), written);
+    }
 }
