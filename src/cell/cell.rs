@@ -237,4 +237,28 @@ impl Cell {
     pub fn next_deadline(&self) -> Option<Duration> {
         self.deadline
     }
+
+    pub(super) fn push(&mut self, command: Command) {
+        self.commands.push(command);
+    }
+
+    pub(super) fn machine(&self, device: Device) -> &MachineStatus {
+        &self.machines[device as usize]
+    }
+
+    pub(super) fn machine_mut(&mut self, device: Device) -> &mut MachineStatus {
+        &mut self.machines[device as usize]
+    }
+
+    pub(super) fn raise(&mut self, id: AlarmId, case: &str) {
+        let alarm = Alarm::new(id, case);
+        self.active_alarms.insert(id, Arc::new(alarm.clone()));
+        self.push(Command::Raise(alarm));
+    }
+
+    pub(super) fn withdraw(&mut self, alarm: AlarmId) {
+        if self.active_alarms.remove(&alarm).is_some() {
+            self.push(Command::Withdraw { alarm });
+        }
+    }
 }

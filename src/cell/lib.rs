@@ -22,16 +22,23 @@
 mod alarm;
 mod cell;
 mod command;
+mod connections;
 mod cycle_row;
+mod ending;
 mod event;
+mod interruptions;
 mod interval;
 mod judge;
+mod machine_job;
+mod measurement;
 mod number;
+mod phase_queries;
 mod plan;
+mod run_sequence;
 mod state;
 mod state_machine;
 mod table;
-mod transitions;
+mod time_limits;
 
 pub use alarm::{Alarm, AlarmId, Role};
 pub use cell::Cell;

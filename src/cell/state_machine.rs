@@ -6,10 +6,10 @@ use super::alarm::AlarmId;
 use super::cell::{Cell, SuspensionCause};
 use super::command::Command;
 use super::event::{Event, JobResult, MachineRequest};
-use super::state::{Device, JobStep, Phase, State};
-use super::transitions::{
-    awaits_answer, device_awaiting_acknowledge, reason_clause, reconciling_device, restart_phase, running_device,
+use super::phase_queries::{
+    awaits_answer, device_awaiting_acknowledge, reconciling_device, restart_phase, running_device,
 };
+use super::state::{Device, JobStep, Phase, State};
 
 use Phase::{Compensate, Grind, Load, Measure, Register};
 use State::{
@@ -358,4 +358,10 @@ fn shows_job(event: &Event, of: Device) -> bool {
         | Event::Ended { device, .. } => *device == of,
         _ => false,
     }
+}
+
+/// Returns the text ", because " with `reason` after it. `reason` is the reason that a person gave. Returns an empty
+/// string if `reason` is empty.
+fn reason_clause(reason: &str) -> String {
+    if reason.is_empty() { String::new() } else { format!(", because {reason}") }
 }

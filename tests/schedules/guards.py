@@ -22,7 +22,7 @@ GUARDS = {
         "src/drive/orders.rs", "self.record.queue(ticket, RecordAction::Answer { answer, accepted, message });",
         "drop((ticket, answer.send(Reply { accepted, message, status: self.snapshot() })));"),
     "an abort gives up what the machine is asked": (
-        "src/drive/station.rs", "() = aborts.wait_for_abort() => {}", "() = std::future::pending() => {}"),
+        "src/drive/station.rs", "() = aborts.wait_for_abort() => {}\n                        () = self.handle_request(ask)", "() = std::future::pending() => {}\n                        () = self.handle_request(ask)"),
     "an abort waits for no record": (
         "src/drive/record_queue.rs", "            | Command::AbortMachine { .. }\n            | Command::VerifyClear", "            | Command::VerifyClear"),
     "a START without an answer is unknown": (
@@ -38,17 +38,17 @@ GUARDS = {
     "a station looks again after the loop has hung": (
         "src/drive/station.rs", "if self.observed.connected => if pulse.is_alive() {", "if self.observed.connected && pulse.is_alive() => if true {"),
     "holding goes on when the link is lost": (
-        "src/cell/transitions.rs", "        if is_holding && phase.moving_device() == Some(device) {\n", "        if is_holding && phase.moving_device() == Some(device) {\n            self.enter_state(Held(phase_after_link_loss(phase)));\n        } else if false {\n"),
+        "src/cell/connections.rs", "        if is_holding && phase.moving_device() == Some(device) {\n", "        if is_holding && phase.moving_device() == Some(device) {\n            self.enter_state(Held(phase_after_link_loss(phase)));\n        } else if false {\n"),
     "a question that is not on record makes the machine hold": (
-        "src/cell/transitions.rs", "                self.push(Command::HoldMachine { device });\n            }\n            _ => self.enter_state(Held(restart_phase(phase))),", "            }\n            _ => self.enter_state(Held(restart_phase(phase))),",
+        "src/cell/interruptions.rs", "                self.push(Command::HoldMachine { device });\n            }\n            _ => self.enter_state(Held(restart_phase(phase))),", "            }\n            _ => self.enter_state(Held(restart_phase(phase))),",
         "cell", "unrecorded_reconcile_never_shows_held"),
     "a job found running while holding is told to hold": (
-        "src/cell/transitions.rs", "                self.enter_state(self.state_with_phase(run));\n                self.push(Command::HoldMachine { device });\n", "                self.enter_state(self.state_with_phase(run));\n"),
+        "src/cell/machine_job.rs", "                self.enter_state(self.state_with_phase(run));\n                self.push(Command::HoldMachine { device });\n", "                self.enter_state(self.state_with_phase(run));\n"),
     "a machine that moves while the cell stands is told to hold": (
-        "src/cell/transitions.rs", "        let astray = self.machine(device).moves_unordered;\n", "        return;\n        #[allow(unreachable_code)]\n        let astray = false;\n",
+        "src/cell/interruptions.rs", "        let astray = self.machine(device).moves_unordered;\n", "        return;\n        #[allow(unreachable_code)]\n        let astray = false;\n",
         "cell", "motion_while_held_commands_hold"),
     "a program that was started again asks what became of the job": (
-        "src/cell/transitions.rs", "        self.enter_state(Held(phase_after_link_loss(phase)));\n        for device in Device::BOTH {", "        self.enter_state(Held(restart_phase(phase)));\n        for device in Device::BOTH {"),
+        "src/cell/connections.rs", "        self.enter_state(Held(phase_after_link_loss(phase)));\n        for device in Device::BOTH {", "        self.enter_state(Held(restart_phase(phase)));\n        for device in Device::BOTH {"),
     "an answer of an older connection is turned away": (
         "src/device/modbus/link.rs", "        if stale {\n", "        if stale && false {\n"),
     "nothing may wait when a request begins": (
@@ -60,7 +60,7 @@ GUARDS = {
     "payloads in force are compared before a job": (
         "src/device/modbus/mod.rs", "            self.compare_slot(kind).await?;\n", "            let _ = kind;\n"),
     "what was seen to begin has begun, whatever the machine says": (
-        "src/cell/transitions.rs", "(Reconciliation::NotStarted, _) if self.job_observed[device as usize] => {", "(Reconciliation::NotStarted, _) if self.job_observed[device as usize] && false => {"),
+        "src/cell/machine_job.rs", "(Reconciliation::NotStarted, _) if self.job_observed[device as usize] => {", "(Reconciliation::NotStarted, _) if self.job_observed[device as usize] && false => {"),
     "what has not come on record is withdrawn while the disk is full": (
         "src/drive/recording.rs", "        if self.record.failure_reason.is_none() || self.ending.is_some() {\n", "        if true {\n"),
     "an abort of a lost I++ connection is given anew": (
