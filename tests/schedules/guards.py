@@ -29,7 +29,7 @@ GUARDS = {
         "src/drive/station.rs", "self.report(Event::StartUnknown { device: B::DEVICE, cycle, reason: error.to_string() }).await;",
         "self.observed.running = false; self.report_failure(MachineRequest::Start, error).await;"),
     "a START that was not seen is fenced off": (
-        "src/device/modbus/mod.rs", "        self.claim().await?;\n        let second", "        let second",
+        "src/device/modbus/commands.rs", "        self.claim().await?;\n        let second", "        let second",
         "device", "late_start_after_reconcile_is_fenced"),
     "a machine that was lost is sent no START": (
         "src/drive/station.rs", "        if self.observed.link_lost {\n            return self.refuse_unsent(MachineRequest::Start).await;\n        }\n", ""),
@@ -58,7 +58,7 @@ GUARDS = {
     "a connection is given up after an error": (
         "src/device/modbus/link.rs", "        if !matches!(fault, LinkFault::Exception(_)) {\n            self.drop_connection();", "        if false {\n            self.drop_connection();"),
     "payloads in force are compared before a job": (
-        "src/device/modbus/mod.rs", "            self.compare_slot(kind).await?;\n", "            let _ = kind;\n"),
+        "src/device/modbus/commands.rs", "            self.compare_slot(kind).await?;\n", "            let _ = kind;\n"),
     "what was seen to begin has begun, whatever the machine says": (
         "src/cell/machine_job.rs", "(Reconciliation::NotStarted, _) if self.job_observed[device as usize] => {", "(Reconciliation::NotStarted, _) if self.job_observed[device as usize] && false => {"),
     "what has not come on record is withdrawn while the disk is full": (

@@ -3,8 +3,11 @@
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
+use super::link::Link;
+use super::machine::ModbusMachine;
 use super::protocol::{Registers, decode_outcome, decode_pass_record, decode_point, point_registers};
-use super::{LineAddress, Link, ModbusMachine, ModbusSettings, WordOrder};
+use super::result_header::MAX_RESULT_BYTES;
+use super::settings::{LineAddress, ModbusSettings, WordOrder};
 use crate::{Job, MachineKind, Status};
 
 /// Returns a driver for tests. The address of its Modbus line does not exist, and nothing is sent on the line.
@@ -60,7 +63,7 @@ fn assert_header(machine: &ModbusMachine, words: &[u16]) {
         let Ok(header) = machine.header(words, job, kind, block.u32(46)) else { continue };
         let temperature_c = header.temperature_c.unwrap_or(0.0);
         let told = [header.probe_radius_mm, header.scale_mm, temperature_c, header.duration_s];
-        assert!(told.into_iter().all(f64::is_finite) && header.bytes <= super::MAX_RESULT_BYTES);
+        assert!(told.into_iter().all(f64::is_finite) && header.bytes <= MAX_RESULT_BYTES);
         assert_eq!(header.bytes as usize, 2 * header.registers * header.records as usize);
     }
 }

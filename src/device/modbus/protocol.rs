@@ -18,6 +18,9 @@ impl WordOrder {
     }
 }
 
+/// Number of data registers in a full page.
+pub(super) const PAGE_REGISTERS: usize = 112;
+
 /// Registers that were read, with the values at their offsets. An offset outside reads as zero, so the length has to be
 /// checked only once.
 #[derive(Debug, Clone, Copy)]

@@ -9,8 +9,11 @@
 use std::time::Duration;
 
 use super::link::LinkRequest;
-use super::protocol::{self, Registers};
-use super::{Header, MAX_RESULT_BYTES, ModbusMachine, PAGE_REGISTERS, StatusBlock};
+use super::machine::ModbusMachine;
+use super::pages_ahead::{ReadAhead, ReadAheadFailures};
+use super::protocol::{self, PAGE_REGISTERS, Registers};
+use super::result_header::Header;
+use super::status_block::StatusBlock;
 use crate::{DeviceError, Interrupt, Job, MachineState, MeasuredPoint, PreliminaryPoints, digest};
 
 /// Maximum transmission time of a page. An order waits for the request under way, so nothing is read ahead if a page
@@ -22,53 +25,6 @@ const PAGE_BYTES: u32 = 8 + 237;
 const MAX_READS: u32 = 10;
 /// Number of failures after which reading ahead stops for the job. Its other pages are read when it has ended.
 const MAX_FAILURES: u32 = 3;
-
-/// Pages that were read ahead, with the connection, boot and job to which they belong.
-#[derive(Debug)]
-pub(super) struct ReadAhead {
-    generation: u64,
-    boot_id: u32,
-    start: u32,
-    job: Job,
-    header: Header,
-    /// Data registers of the pages, from the first page on.
-    words: Vec<u16>,
-    /// Number of reads of the next page since it was selected; `None` if it was not selected.
-    reads_since_select: Option<u32>,
-    /// Progress, as a number of points, at which the next page was read and was not full yet.
-    not_full_at: Option<u32>,
-}
-
-/// Failures of the read-ahead in a job.
-#[derive(Debug, Default)]
-pub(super) struct ReadAheadFailures {
-    start: u32,
-    count: u32,
-}
-
-impl ReadAhead {
-    /// Returns the number of measured points whose registers are complete in the pages stored so far. A page is one
-    /// block of registers of the result of a measurement.
-    fn point_count(&self) -> usize {
-        self.words.len() / self.header.registers
-    }
-
-    fn next_page(&self) -> u32 {
-        (self.words.len() / PAGE_REGISTERS) as u32
-    }
-
-    /// Returns true if the next page (block of registers) of the partial result should be read now, because the machine
-    /// has measured enough points to fill this page. `progress` is the number of measured points in the last status of
-    /// the machine.
-    ///
-    /// Returns false if this page was already read when the machine reported the same `progress`, and the page was not
-    /// full then. Also returns false if the stored pages would exceed the maximum size of a result.
-    fn is_due(&self, progress: u32) -> bool {
-        let registers = u64::from(progress) * self.header.registers as u64;
-        let end = self.words.len() + PAGE_REGISTERS;
-        end as u64 <= registers && 2 * end <= MAX_RESULT_BYTES as usize && self.not_full_at != Some(progress)
-    }
-}
 
 impl ModbusMachine {
     /// Reads preliminary points of `job` while the machine still executes `job`. The machine stores its result as one

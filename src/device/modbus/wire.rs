@@ -1,7 +1,8 @@
 //! The two Modbus wires, for the table of drivers.
 
+use super::drivers::{ModbusCmm, ModbusGrinder};
+use super::link::Link;
 use super::settings::{LineAddress, ModbusSettings, RtuWire, TcpWire};
-use super::{Link, ModbusCmm, ModbusGrinder};
 use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
 use crate::machine_table::MachineTable;
 use regrind_document::Document;
