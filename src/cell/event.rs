@@ -263,7 +263,8 @@ pub enum Condition {
     Signals,
 }
 
-/// Request to a machine.
+/// Request of the cell that a machine can refuse, under its name in the record. It has no CLAIM and no RELEASE: these
+/// commands belong to the driver of a machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MachineRequest {

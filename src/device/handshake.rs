@@ -185,7 +185,8 @@ impl Reconciled {
     }
 }
 
-/// Command of the handshake.
+/// Command of the handshake between a driver and its machine, with its number on the Modbus wire. It has no transfer of
+/// a payload or a result: these are no commands of the machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u16)]
 #[expect(missing_docs, reason = "the same words as the methods of `Machine`")]

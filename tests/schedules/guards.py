@@ -72,10 +72,10 @@ GUARDS = {
         "src/device/ippdme/link.rs", "if response.tag == pending.tag {", "if response.tag == pending.tag || matches!(response.tag, Tag::Command(_)) {",
         "device", "unrequested_data_disconnects"),
     "an I++ job is held between two targets": (
-        "src/device/ippdme/job.rs", "if self.current_request() != JobRequest::Continue {\n                    break 'job;", "if false && self.current_request() != JobRequest::Continue {\n                    break 'job;",
+        "src/device/ippdme/job.rs", "if self.current_request().is_some() {\n                    break 'job;", "if false && self.current_request().is_some() {\n                    break 'job;",
         "device", "hold_retracts_resume_touches_rest"),
     "an I++ job is held between two rows": (
-        "src/device/ippdme/job.rs", "if self.current_request() != JobRequest::Continue {\n                    break;", "if false && self.current_request() != JobRequest::Continue {\n                    break;",
+        "src/device/ippdme/job.rs", "if self.current_request().is_some() {\n                    break;", "if false && self.current_request().is_some() {\n                    break;",
         "device", "hold_in_scan_defers_next_row"),
     "the probe travels at the clearance": (
         "src/device/ippdme/job.rs", "        self.rise(work).await?;\n        let [x, y, z]", "        let [x, y, z]"),

@@ -13,7 +13,7 @@ use super::route::{Leg, Route, approach, point_on_normal};
 use super::settings::IppdmeSettings;
 use super::syntax::Item;
 use crate::error::DeviceError;
-use crate::handshake::{Fault, Job, MachineState, Outcome};
+use crate::handshake::{Fault, Job, MachineCommand, MachineState, Outcome};
 use crate::payload::{MeasuredPoint, Plan, PlanTarget, TouchStatus};
 
 /// Server errors of a touch that do not end the job: the next touch can succeed. Unexpected contact, illegal touch, no
@@ -32,14 +32,6 @@ const HOMING_TIMEOUT: Duration = Duration::from_secs(300);
 pub(super) struct RoutedPlan {
     pub(super) plan: Plan,
     pub(super) route: Route,
-}
-
-/// Request to the task that executes the job. The task carries it out at the next safe position of the probe.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum JobRequest {
-    Continue,
-    Hold,
-    Stop,
 }
 
 /// Order to the task that owns the session.
@@ -112,7 +104,7 @@ pub(super) struct Worker {
     pub(super) session: Session,
     pub(super) shared: Arc<Mutex<SharedState>>,
     pub(super) orders: mpsc::Receiver<WorkerOrder>,
-    pub(super) job_request: watch::Receiver<JobRequest>,
+    pub(super) job_request: watch::Receiver<Option<MachineCommand>>,
     pub(super) settings: Arc<IppdmeSettings>,
     /// Position of the probe's centre, if it is known.
     pub(super) position_mm: Option<[f64; 3]>,
@@ -225,7 +217,7 @@ impl Worker {
             if let Leg::Scan(row) = leg
                 && locked(&self.shared).points[row.clone()].iter().any(Option::is_none)
             {
-                if self.current_request() != JobRequest::Continue {
+                if self.current_request().is_some() {
                     break;
                 }
                 if self.scan(work, row.clone()).await? {
@@ -233,7 +225,7 @@ impl Worker {
                 }
             }
             for k in leg.targets() {
-                if self.current_request() != JobRequest::Continue {
+                if self.current_request().is_some() {
                     break 'job;
                 }
                 if locked(&self.shared).points[k].is_some() {
@@ -257,9 +249,9 @@ impl Worker {
         shared.clear_of_part = Some(true);
         (shared.state, shared.outcome) = match wish {
             _ if shared.points.iter().all(Option::is_some) => (MachineState::Complete, Outcome::Complete),
-            JobRequest::Stop => (MachineState::Complete, Outcome::Stopped),
+            Some(MachineCommand::Stop) => (MachineState::Complete, Outcome::Stopped),
             // Held, or resumed at the last moment.
-            JobRequest::Hold | JobRequest::Continue => (MachineState::Held, Outcome::None),
+            _ => (MachineState::Held, Outcome::None),
         };
         Ok(())
     }
@@ -275,16 +267,16 @@ impl Worker {
         Err(Failure::Refused(ServerError { severity: 3, number: 2504, cause: String::new(), text }))
     }
 
-    /// Returns the current request of the client for the job: continue, hold or stop. Returns `Hold` and changes the
-    /// state to HOLDING if the state is EXECUTE and the last status request is older than `silence_limit`: the client
-    /// is then assumed to be lost.
-    fn current_request(&self) -> JobRequest {
+    /// Returns the current request of the client for the job: HOLD, STOP, or `None` to continue. Returns HOLD and
+    /// changes the state to HOLDING if the state is EXECUTE and the last status request is older than `silence_limit`:
+    /// the client is then assumed to be lost.
+    fn current_request(&self) -> Option<MachineCommand> {
         let mut shared = locked(&self.shared);
         if shared.state == MachineState::Execute && shared.last_status_request.elapsed() > self.settings.silence_limit {
             shared.state = MachineState::Holding;
             shared.stop_reason =
                 Some("the machine holds, because Regrind sent no status request within the time limit".to_owned());
-            return JobRequest::Hold;
+            return Some(MachineCommand::Hold);
         }
         *self.job_request.borrow()
     }

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 
-use super::job::{JobRequest, RoutedPlan, SharedState, Worker, WorkerOrder, locked, request_if_supported};
+use super::job::{RoutedPlan, SharedState, Worker, WorkerOrder, locked, request_if_supported};
 use super::link::{Failure, Session};
 use super::response::values;
 use super::route::Route;
@@ -37,7 +37,8 @@ pub struct IppdmeCmm {
     settings: Arc<IppdmeSettings>,
     shared: Arc<Mutex<SharedState>>,
     aborts: watch::Sender<u64>,
-    job_request: watch::Sender<JobRequest>,
+    /// HOLD or STOP, which the task carries out at the next safe position of the probe; `None` to continue.
+    job_request: watch::Sender<Option<MachineCommand>>,
     /// Order channel of the task that owns the session; `None` without a session.
     orders: Option<mpsc::Sender<WorkerOrder>>,
     identity: Option<Identity>,
@@ -67,7 +68,7 @@ impl IppdmeCmm {
             settings: Arc::new(settings),
             shared: Arc::new(Mutex::new(SharedState::new())),
             aborts: watch::Sender::new(0),
-            job_request: watch::Sender::new(JobRequest::Continue),
+            job_request: watch::Sender::new(None),
             orders: None,
             identity: None,
             memory: JobMemory::new(),
@@ -339,7 +340,7 @@ impl Machine for IppdmeCmm {
         let Some((work, _)) = self.work.clone().filter(|_| ours) else {
             return Err(self.refused(MachineCommand::Start, Answer::OtherJob));
         };
-        self.job_request.send_replace(JobRequest::Continue);
+        self.job_request.send_replace(None);
         locked(&self.shared).last_status_request = Instant::now();
         let status = self.transition(MachineCommand::Start, &[MachineState::Prepared], MachineState::Execute)?;
         self.memory.last_start_sequence = start_sequence;
@@ -353,7 +354,7 @@ impl Machine for IppdmeCmm {
 
     async fn hold(&mut self) -> DeviceResult<Status> {
         let status = self.transition(MachineCommand::Hold, &[MachineState::Execute], MachineState::Holding)?;
-        self.job_request.send_replace(JobRequest::Hold);
+        self.job_request.send_replace(Some(MachineCommand::Hold));
         Ok(status)
     }
 
@@ -361,7 +362,7 @@ impl Machine for IppdmeCmm {
         let Some((work, _)) = self.work.clone() else {
             return Err(self.refused(MachineCommand::Resume, Answer::WrongState));
         };
-        self.job_request.send_replace(JobRequest::Continue);
+        self.job_request.send_replace(None);
         locked(&self.shared).last_status_request = Instant::now();
         let status = self.transition(MachineCommand::Resume, &[MachineState::Held], MachineState::Execute)?;
         locked(&self.shared).stop_reason = None;
@@ -393,7 +394,7 @@ impl Machine for IppdmeCmm {
                     &[MachineState::Execute, MachineState::Holding],
                     MachineState::Stopping,
                 )?;
-                self.job_request.send_replace(JobRequest::Stop);
+                self.job_request.send_replace(Some(MachineCommand::Stop));
                 Ok(status)
             }
         }
