@@ -26,15 +26,15 @@ GUARDS = {
     "an abort waits for no record": (
         "src/drive/record_queue.rs", "            | Command::AbortMachine { .. }\n            | Command::VerifyClear", "            | Command::VerifyClear"),
     "a START without an answer is unknown": (
-        "src/drive/station.rs", "self.report(Event::StartUnknown { device: B::DEVICE, cycle, reason: error.to_string() }).await;",
+        "src/drive/station/commands.rs", "self.report(Event::StartUnknown { device: B::DEVICE, cycle, reason: error.to_string() }).await;",
         "self.observed.running = false; self.report_failure(MachineRequest::Start, error).await;"),
     "a START that was not seen is fenced off": (
         "src/device/modbus/commands.rs", "        self.claim().await?;\n        let second", "        let second",
         "device", "late_start_after_reconcile_is_fenced"),
     "a machine that was lost is sent no START": (
-        "src/drive/station.rs", "        if self.observed.link_lost {\n            return self.refuse_unsent(MachineRequest::Start).await;\n        }\n", ""),
+        "src/drive/station/commands.rs", "        if self.observed.link_lost {\n            return self.refuse_unsent(MachineRequest::Start).await;\n        }\n", ""),
     "a machine that was lost is sent no RESUME": (
-        "src/drive/station.rs", "        if self.observed.link_lost {\n            return self.refuse_unsent(MachineRequest::Resume).await;\n        }\n", ""),
+        "src/drive/station/commands.rs", "        if self.observed.link_lost {\n            return self.refuse_unsent(MachineRequest::Resume).await;\n        }\n", ""),
     "a station looks again after the loop has hung": (
         "src/drive/station.rs", "if self.observed.connected => if pulse.is_alive() {", "if self.observed.connected && pulse.is_alive() => if true {"),
     "holding goes on when the link is lost": (
