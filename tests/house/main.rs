@@ -44,7 +44,7 @@ const ARROWS: [(&str, &str, &[&str]); 25] = [
     ),
     (
         "setup",
-        "src/setup.rs",
+        "src/setup",
         &[CORE[0], CORE[1], CORE[2], CORE[3], CORE[4], "cell", "config", "device", "drive", "formats", "recipe"],
     ),
 ];
