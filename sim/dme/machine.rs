@@ -255,24 +255,9 @@ impl DmeMachine {
     /// unsupported command.
     pub(super) fn carry_out(&mut self, command: &Command) -> Result<CommandResult, DmeError> {
         let no = |number| DmeError::new(number, &command.name);
-        let arguments = &command.arguments[..];
-        let text = |text: String| Ok(CommandResult::with_data(vec![text]));
         self.joystick &= !moves(&command.name);
         self.current_command.clone_from(&command.name);
-        match (command.name.as_str(), arguments) {
-            ("GetDMEVersion", []) => text(format!("DMEVersion(\"{}\")", self.options.version)),
-            ("GetMachineClass", []) => text(format!("GetMachineClass(\"{}\")", self.options.class)),
-            ("IsHomed", []) => text(format!("IsHomed({})", u8::from(self.homed))),
-            ("IsUserEnabled", []) => text(format!("IsUserEnabled({})", u8::from(self.joystick))),
-            ("EnableUser" | "DisableUser", []) => {
-                self.joystick = command.name == "EnableUser";
-                Ok(CommandResult::default())
-            }
-            ("GetXtdErrStatus", []) => text(format!("IsHomed({})", u8::from(self.homed))),
-            ("EnumTools", []) => {
-                let data = self.options.tools.iter().map(|(name, _)| vec![format!("\"{name}\"")]).collect();
-                Ok(CommandResult { data, ..CommandResult::default() })
-            }
+        match (command.name.as_str(), &command.arguments[..]) {
             ("Home", []) => {
                 let [least, most] = self.probe.volume_mm();
                 let corner = [least[0], most[1], most[2]];
@@ -289,6 +274,25 @@ impl DmeMachine {
                 self.start_motion(self.at_mm);
                 Ok(CommandResult { seconds: 10.0, ..CommandResult::default() })
             }
+            ("GoTo", axes) => {
+                let to = self.place(axes).ok_or_else(|| no(502))?;
+                self.check_volume(to).map_err(no)?;
+                Ok(self.start_motion(to))
+            }
+            ("PtMeas", axes) => self.touch(axes).map_err(no),
+            ("ScanOnCurve", [closed, format, data]) => self.scan(closed, format, data).map_err(no),
+            _ => self.apply_setting(command),
+        }
+    }
+
+    /// Computes the effect of a command that selects a setting. Passes any other command to [`Self::answer_query`].
+    fn apply_setting(&mut self, command: &Command) -> Result<CommandResult, DmeError> {
+        let no = |number| DmeError::new(number, &command.name);
+        match (command.name.as_str(), &command.arguments[..]) {
+            ("EnableUser" | "DisableUser", []) => {
+                self.joystick = command.name == "EnableUser";
+                Ok(CommandResult::default())
+            }
             ("SetCoordSystem", [Argument::Name(name, None)]) => {
                 self.in_part_frame = match name.as_str() {
                     "PartCsy" => true,
@@ -296,9 +300,6 @@ impl DmeMachine {
                     _ => return Err(no(509)),
                 };
                 Ok(CommandResult::default())
-            }
-            ("GetCoordSystem", []) => {
-                text(format!("CoordSystem({})", if self.in_part_frame { "PartCsy" } else { "MachineCsy" }))
             }
             ("SetCsyTransformation", [Argument::Name(name, None), rest @ ..]) if name == "PartCsy" => {
                 let numbers: Vec<f64> =
@@ -310,11 +311,6 @@ impl DmeMachine {
                 self.part_frame = Frame::new(written);
                 Ok(CommandResult::default())
             }
-            ("GetCsyTransformation", [Argument::Name(name, None)]) if name == "PartCsy" => {
-                let numbers = self.part_frame.written.map(|n| n.to_string()).join(", ");
-                text(format!("GetCsyTransformation({numbers})"))
-            }
-            ("GetProp", properties) => self.get(properties).map_err(no),
             ("SetProp", properties) => self.set(properties, &command.name).map_err(no),
             ("OnPtMeasReport", fields) => {
                 let names: Option<Vec<String>> = fields.iter().map(query_name).collect();
@@ -336,7 +332,32 @@ impl DmeMachine {
                 self.at_nominals = fields.contains(&nominals);
                 Ok(CommandResult::default())
             }
-            ("ScanOnCurve", [closed, format, data]) => self.scan(closed, format, data).map_err(no),
+            _ => self.answer_query(command),
+        }
+    }
+
+    /// Returns the answer to a query. Refuses any other command with the error 501.
+    fn answer_query(&self, command: &Command) -> Result<CommandResult, DmeError> {
+        let no = |number| DmeError::new(number, &command.name);
+        let text = |text: String| Ok(CommandResult::with_data(vec![text]));
+        match (command.name.as_str(), &command.arguments[..]) {
+            ("GetDMEVersion", []) => text(format!("DMEVersion(\"{}\")", self.options.version)),
+            ("GetMachineClass", []) => text(format!("GetMachineClass(\"{}\")", self.options.class)),
+            ("IsHomed", []) => text(format!("IsHomed({})", u8::from(self.homed))),
+            ("IsUserEnabled", []) => text(format!("IsUserEnabled({})", u8::from(self.joystick))),
+            ("GetXtdErrStatus", []) => text(format!("IsHomed({})", u8::from(self.homed))),
+            ("EnumTools", []) => {
+                let data = self.options.tools.iter().map(|(name, _)| vec![format!("\"{name}\"")]).collect();
+                Ok(CommandResult { data, ..CommandResult::default() })
+            }
+            ("GetCoordSystem", []) => {
+                text(format!("CoordSystem({})", if self.in_part_frame { "PartCsy" } else { "MachineCsy" }))
+            }
+            ("GetCsyTransformation", [Argument::Name(name, None)]) if name == "PartCsy" => {
+                let numbers = self.part_frame.written.map(|n| n.to_string()).join(", ");
+                text(format!("GetCsyTransformation({numbers})"))
+            }
+            ("GetProp", properties) => self.get(properties).map_err(no),
             ("Get", fields) => {
                 let at = self.frame().machine_to_part(self.at_mm);
                 let told = fields.iter().map(|field| {
@@ -346,12 +367,6 @@ impl DmeMachine {
                 });
                 told.collect::<Option<_>>().map(CommandResult::with_data).ok_or_else(|| no(502))
             }
-            ("GoTo", axes) => {
-                let to = self.place(axes).ok_or_else(|| no(502))?;
-                self.check_volume(to).map_err(no)?;
-                Ok(self.start_motion(to))
-            }
-            ("PtMeas", axes) => self.touch(axes).map_err(no),
             _ => Err(no(501)),
         }
     }

@@ -322,33 +322,17 @@ fn sample_figures() -> Vec<Figures> {
         unstated: None,
         further_touches: None,
     };
+    let left_out = |can_repeat| {
+        let outliers = OutlierFigures { pv_mm: 0.050, rms_mm: 0.002, description: String::new(), can_repeat };
+        Figures { pv_mm: 0.005, rms_mm: 0.001, with_outliers: Some(Box::new(outliers)), ..plain.clone() }
+    };
     let mut all = vec![
         plain.clone(),
         Figures { pv_mm: 0.020, rms_mm: 0.004, ..plain.clone() },
         Figures { pv_mm: 0.060, ..plain.clone() },
         Figures { pv_mm: 0.005, rms_mm: 0.001, ..plain.clone() },
-        Figures {
-            pv_mm: 0.005,
-            rms_mm: 0.001,
-            with_outliers: Some(Box::new(OutlierFigures {
-                pv_mm: 0.050,
-                rms_mm: 0.002,
-                description: String::new(),
-                can_repeat: false,
-            })),
-            ..plain.clone()
-        },
-        Figures {
-            pv_mm: 0.005,
-            rms_mm: 0.001,
-            with_outliers: Some(Box::new(OutlierFigures {
-                pv_mm: 0.050,
-                rms_mm: 0.002,
-                description: String::new(),
-                can_repeat: true,
-            })),
-            ..plain.clone()
-        },
+        left_out(false),
+        left_out(true),
         Figures { coverage: 0.5, ..plain.clone() },
         Figures { shift_mm: 5.0, ..plain.clone() },
         Figures { rotation_rad: 3.0, ..plain.clone() },

@@ -263,15 +263,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         let programs = task.programs.as_ref().map_err(|error| Failure::Programs(error.clone().into()))?;
         programs.write(file, &first, task.map_identity(&first)).map_err(Failure::Programs)?;
     }
-    let [width, depth] = [task.pass.x_mm, task.pass.y_mm].map(|[low, high]| high - low);
-    // Without a program, tracks over the box around the part are the best estimate.
-    let (tracks, pass_mm) = match &program {
-        Some((path, summary)) => (path.track_count() as f64, summary.length_mm),
-        None => {
-            let tracks = (depth / task.pass.track_spacing_mm).floor() + 1.0;
-            (tracks, tracks * width)
-        }
-    };
+    let (tracks, pass_mm) = tracks_and_length_mm(&task, program.as_ref());
     let path_mm = pass_mm * f64::from(1 + task.pass.spark_out_passes);
     let depth_um = 1e3 * task.correction_limits.depth_of_cut_mm;
     let passes = f64::from(plan.max_cycles.max(1) - 1);
@@ -323,6 +315,19 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         super::print(&words(&document))?;
     }
     Ok(Outcome::Accepted)
+}
+
+/// Returns the number of tracks of a pass and its length in mm. `program` is the path of the pass with its summary.
+/// Without a program, tracks over the box around the part are the best estimate.
+fn tracks_and_length_mm(task: &Task, program: Option<&(ToolPath, PathSummary)>) -> (f64, f64) {
+    let [width, depth] = [task.pass.x_mm, task.pass.y_mm].map(|[low, high]| high - low);
+    match program {
+        Some((path, summary)) => (path.track_count() as f64, summary.length_mm),
+        None => {
+            let tracks = (depth / task.pass.track_spacing_mm).floor() + 1.0;
+            (tracks, tracks * width)
+        }
+    }
 }
 
 /// Returns the summary of the circular arcs in the grinding program of the first pass. `program` is the path of this
