@@ -3,6 +3,7 @@
 //! The compiler enforces the dependencies between crates. These tests enforce the rest.
 
 mod circles;
+mod functions;
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -349,6 +350,24 @@ fn library_does_not_use_cli() {
     let found = sources("src");
     let others = found.iter().filter(|s| !is_in(s, "src/cli") && !is_in(s, "src/main.rs"));
     assert_absent(others, &["clap", "crate::cli", "mod cli"]);
+}
+
+#[test]
+fn functions_have_at_most_70_lines() {
+    for source in sources("src").into_iter().chain(sources("sim")) {
+        for (name, lines) in functions::functions(&source.code) {
+            // The transition table of the cell is one flat match.
+            let is_table = name == "transition" && is_in(&source, "src/cell/state_machine.rs");
+            assert!(lines <= 70 || is_table, "{}: `{name}` has {lines} lines", source.path.display());
+        }
+    }
+}
+
+#[test]
+fn functions_read_names_and_lines() {
+    let code = "trait A {\n    fn a(\n        &self,\n    ) -> fn (u8);\n    fn b() {}\n}\n\
+                pub(super) const unsafe fn c() {\n    let d = 1;\n\n    if d == 1 {\n    }\n}\nconst E: fn (u8) = f;\n";
+    assert_eq!(functions::functions(code), [("a", 3), ("b", 1), ("c", 6)]);
 }
 
 /// Number of circles that are left. It may only fall.
