@@ -20,30 +20,27 @@ use crate::journal::{self};
 impl Drive {
     pub(super) async fn execute(&mut self, command: Command) {
         match command {
-            Command::Connect { device } => self.machines.send(device, StationRequest::Connect).await,
+            Command::Connect { device }
+            | Command::VerifyClear { device }
+            | Command::StartMachine { device, .. }
+            | Command::ResumeMachine { device }
+            | Command::ClearMachine { device }
+            | Command::Reconcile { device, .. }
+            | Command::Acknowledge { device } => self.machines.send(device, StationRequest::Command(command)).await,
+            Command::HoldMachine { device } | Command::StopMachine { device } => {
+                self.machines.send_urgent(device, StationRequest::Command(command)).await
+            }
+            Command::AbortMachine { device } => self.machines.abort(device).await,
+            Command::Collect { .. } => self.machines.send(Device::Cmm, StationRequest::Command(command)).await,
             Command::AskToLoad => self.ask_to_load().await,
             Command::LoadPass { cycle } => self.load_pass(cycle).await,
             Command::LoadPlan { cycle } => self.load_plan(cycle).await,
-            Command::VerifyClear { device } => self.machines.send(device, StationRequest::VerifyClear).await,
             Command::AskWhetherClear { device } => self.notify(Notice::AskWhetherClear { device }),
             Command::Prepare { device, cycle } => {
                 let batch = if device == Device::Cmm { self.cycles.batch(cycle) } else { 0 };
                 self.machines.send(device, StationRequest::Prepare { number: BatchId { cycle, batch } }).await;
             }
-            Command::StartMachine { device, cycle } => {
-                self.machines.send(device, StationRequest::Start { cycle }).await
-            }
-            Command::HoldMachine { device } => self.machines.send_urgent(device, StationRequest::Hold).await,
-            Command::ResumeMachine { device } => self.machines.send(device, StationRequest::Resume).await,
-            Command::StopMachine { device } => self.machines.send_urgent(device, StationRequest::Stop).await,
-            Command::AbortMachine { device } => self.machines.abort(device).await,
-            Command::ClearMachine { device } => self.machines.send(device, StationRequest::Clear).await,
-            Command::Reconcile { device, cycle } => {
-                self.machines.send(device, StationRequest::Reconcile { cycle }).await
-            }
-            Command::Collect { cycle } => self.machines.send(Device::Cmm, StationRequest::Collect { cycle }).await,
             Command::Qualify { cycle } => self.qualify(cycle),
-            Command::Acknowledge { device } => self.machines.send(device, StationRequest::Acknowledge).await,
             Command::Register { cycle } => self.register(cycle),
             Command::Compensate { cycle } => self.compensate(cycle),
             Command::Announce(judgement) => self.announce(judgement).await,

@@ -8,7 +8,7 @@ use tokio::task::JoinHandle;
 use super::station::{
     AbortCounter, CmmDriver, GrinderDriver, LoopWatchdog, MachineTask, StationDriver, StationReport, StationRequest,
 };
-use crate::cell::Device;
+use crate::cell::{Command, Device};
 use crate::device::{Armed, Cmm, Grinder, Interrupt};
 use crate::record::StartIntent;
 
@@ -77,7 +77,7 @@ impl Machines {
     /// Orders an abort of a machine. Its task cancels the request in progress.
     pub(super) async fn abort(&self, device: Device) {
         self.abort_counts[device as usize].send_modify(|ordered| *ordered += 1);
-        self.send_urgent(device, StationRequest::Abort).await;
+        self.send_urgent(device, StationRequest::Command(Command::AbortMachine { device })).await;
     }
 
     /// Ends the tasks: each releases its machine. Waits at most 2 s for each.

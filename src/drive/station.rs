@@ -21,7 +21,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::failure::panic_message;
-use crate::cell::{Device, Event};
+use crate::cell::{Command, Device, Event};
 use crate::device::{Armed, BatchId, Interrupt, Machine as _, OperatorConfirmation, PreliminaryPoints};
 use crate::record::EventDetail;
 pub(super) use abort_counter::AbortCounter;
@@ -30,21 +30,15 @@ pub(super) use loop_watchdog::{LoopWatchdog, WATCHDOG_INTERVAL};
 use observed_state::ObservedState;
 pub(super) use start_intent::prepared_job;
 
-/// Request to a machine. The answers are the events that [`crate::cell::Command`] names.
+/// Request to a machine. The answers are the events that [`Command`] names.
 pub(super) enum StationRequest {
-    Connect,
+    /// Command of the cell that needs no other data.
+    Command(Command),
+    /// The command [`Command::LoadPass`] or [`Command::LoadPlan`], with the payload.
     Load { cycle: u32, payload: MachinePayload },
-    VerifyClear,
+    /// The command [`Command::Prepare`], with the batch of the cycle.
     Prepare { number: BatchId },
-    Start { cycle: u32 },
-    Hold,
-    Resume,
-    Stop,
-    Abort,
-    Clear,
-    Reconcile { cycle: u32 },
-    Collect { cycle: u32 },
-    Acknowledge,
+    /// Confirmation of a person.
     Confirm { confirmation: OperatorConfirmation, answer: oneshot::Sender<Result<(), String>> },
 }
 
@@ -157,9 +151,9 @@ impl<B: StationDriver> MachineTask<B> {
             tokio::select! {
                 biased;
                 ask = asks.recv() => match ask {
-                    Some(StationRequest::Abort) => {
+                    Some(abort @ StationRequest::Command(Command::AbortMachine { .. })) => {
                         aborts.handled_count += 1;
-                        self.handle_request(StationRequest::Abort).await;
+                        self.handle_request(abort).await;
                     }
                     Some(ask) => tokio::select! {
                         biased;
@@ -185,24 +179,16 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     async fn handle_request(&mut self, ask: StationRequest) {
-        let urgent = matches!(ask, StationRequest::Hold | StationRequest::Stop | StationRequest::Abort);
+        use Command::{AbortMachine, HoldMachine, StopMachine};
+        let urgent =
+            matches!(ask, StationRequest::Command(HoldMachine { .. } | StopMachine { .. } | AbortMachine { .. }));
         if urgent {
             self.interrupt.lower();
         }
         match ask {
-            StationRequest::Connect => self.connect().await,
+            StationRequest::Command(command) => self.execute(command).await,
             StationRequest::Load { cycle, payload: load } => self.load(cycle, &load).await,
-            StationRequest::VerifyClear => self.verify_clear().await,
             StationRequest::Prepare { number } => self.prepare(number).await,
-            StationRequest::Start { cycle } => self.start(cycle).await,
-            StationRequest::Hold => self.hold().await,
-            StationRequest::Resume => self.resume().await,
-            StationRequest::Stop => self.stop().await,
-            StationRequest::Abort => self.abort().await,
-            StationRequest::Clear => self.clear().await,
-            StationRequest::Reconcile { cycle } => self.reconcile(cycle).await,
-            StationRequest::Collect { cycle } => self.collect(cycle).await,
-            StationRequest::Acknowledge => self.acknowledge().await,
             StationRequest::Confirm { confirmation: word, answer } => {
                 let told = match self.driver.machine().confirm(word).await {
                     Ok(files) => {

@@ -7,11 +7,30 @@ use super::driver::{MachinePayload, StationDriver};
 use super::observed_state::ObservedState;
 use super::start_intent::start_intent;
 use super::translation::{describe_job, fault_message, gate_failure, job_result};
-use crate::cell::{Event, GateResult, MachineRequest, Reconciliation};
+use crate::cell::{Command, Event, GateResult, MachineRequest, Reconciliation};
 use crate::device::{BatchId, DeviceError, Fault, Job, Machine as _, MachineState, Reconciled};
 use crate::record::EventDetail;
 
 impl<B: StationDriver> MachineTask<B> {
+    /// Executes a command of the cell to this machine.
+    pub(super) async fn execute(&mut self, command: Command) {
+        match command {
+            Command::Connect { .. } => self.connect().await,
+            Command::VerifyClear { .. } => self.verify_clear().await,
+            Command::StartMachine { cycle, .. } => self.start(cycle).await,
+            Command::HoldMachine { .. } => self.hold().await,
+            Command::ResumeMachine { .. } => self.resume().await,
+            Command::StopMachine { .. } => self.stop().await,
+            Command::AbortMachine { .. } => self.abort().await,
+            Command::ClearMachine { .. } => self.clear().await,
+            Command::Reconcile { cycle, .. } => self.reconcile(cycle).await,
+            Command::Collect { cycle } => self.collect(cycle).await,
+            Command::Acknowledge { .. } => self.acknowledge().await,
+            // The drive executes the others itself, or sends them with their data.
+            other => unreachable!("{} is sent to no station", other.name()),
+        }
+    }
+
     pub(super) async fn load(&mut self, cycle: u32, load: &MachinePayload) {
         self.loaded_digest = None;
         match self.driver.load(load, &self.interrupt).await {
