@@ -10,10 +10,12 @@ use regrind_page::Session;
 use super::super::ToSql;
 use super::super::error::PlantError;
 use super::super::link::DatabaseLink;
+use super::content::{PageContent, page};
+use super::page_error::PageError;
 use super::rank::{ENOUGH, holm, rank_sum};
 use super::selection::{Selection, SelectionQuery, mark};
+use super::shared::Shared;
 use super::words::{encoded, interval, share, shown, um};
-use super::{PageContent, PageError, Shared, page};
 
 /// Maximum number of cells compared at once, and of parts of each cell (the newest).
 const CELLS: usize = 40;

@@ -10,10 +10,11 @@ use regrind_report::{DfqPart, dfq_of_parts};
 
 use super::super::{Row, ToSql};
 use super::control_chart::Value;
+use super::page_error::{PageError, unmade, within};
 use super::run::file;
 use super::selection::{Selection, SelectionQuery};
+use super::shared::{PlantPage, Shared};
 use super::trend::parts;
-use super::{PageError, PlantPage, Shared, unmade, within};
 
 /// Maximum number of parts in a file.
 const MAX_PARTS: i64 = 20_000;

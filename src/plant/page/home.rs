@@ -12,9 +12,12 @@ use super::super::Row;
 use super::super::error::PlantError;
 use super::super::link::DatabaseLink;
 use super::bars::{Count, Day, bars};
+use super::cells;
+use super::content::{PageContent, page};
+use super::page_error::PageError;
 use super::selection::{is_simulated, mark, today};
+use super::shared::Shared;
 use super::words::{encoded, interval, share, shown};
-use super::{PageContent, PageError, Shared, cells, page};
 
 /// Number of days over which parts are counted.
 const DAYS: i64 = 14;

@@ -13,9 +13,11 @@ use tokio::task::spawn_blocking;
 
 use super::super::copy::content;
 use super::super::link::DatabaseLink;
+use super::content::{PageContent, page};
+use super::page_error::PageError;
 use super::selection::mark;
+use super::shared::Shared;
 use super::words::{shown, um};
-use super::{PageContent, PageError, Shared, page};
 
 /// Maximum number of maps on the page.
 const MAX_MAPS: usize = 4;

@@ -10,8 +10,10 @@ use serde::Deserialize;
 use super::super::error::PlantError;
 use super::super::link::DatabaseLink;
 use super::super::{Row, ToSql};
+use super::content::{PageContent, page};
+use super::page_error::PageError;
+use super::shared::Shared;
 use super::words::{encoded, shown, um};
-use super::{PageContent, PageError, Shared, page};
 
 /// Maximum number of parts on a page.
 const MAX_ROWS: usize = 100;

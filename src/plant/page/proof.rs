@@ -1,77 +1,22 @@
 //! Proof of a run: the plant's copy of the run is fetched into a temporary folder, verified there, and its report and
 //! QIF results are made.
 
-use std::collections::HashMap;
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::sync::Arc;
 
 use jiff::Timestamp;
 use regrind_formats::{FormatError, ScratchFolder};
-use regrind_journal::Verified;
 use regrind_report::{ReportError, ResultsFormat, run_report, run_results};
-use tokio::sync::Semaphore;
 use tokio::task::spawn_blocking;
 
 use super::super::copy::PlantRun;
 use super::super::error::{PlantError, refused};
-use super::PlantPage;
+use super::proofs::Proof;
+use super::shared::PlantPage;
 
-/// Time for which a proof stays valid. The copy in the database can change at any time.
-const LASTS: Duration = Duration::from_secs(60);
-/// Maximum number of proofs in the cache.
-const KEPT: usize = 16;
 /// Time limit of a query, set in SQL. A whole run is fetched here, so the limit is longer than for other pages. Only
 /// one run is fetched at a time.
 const ANSWER: &str = "SET statement_timeout = '60s'";
-
-/// Result of a proof.
-pub(super) struct Proof {
-    /// Time of the proof, UTC.
-    pub(super) at: String,
-    /// Result of the verification; otherwise a text that says why the copy is not trustworthy.
-    pub(super) outcome: Result<Verified, String>,
-    /// Number of keys that the plant has for the cell.
-    pub(super) keys: usize,
-    /// Report of the run, and its results as QIF and as DFQ; otherwise a text why there are none.
-    pub(super) report: Result<String, String>,
-    pub(super) qif: Result<String, String>,
-    pub(super) dfq: Result<String, String>,
-}
-
-type Known = HashMap<i32, (Instant, String, Arc<Proof>)>;
-
-/// Cache of recent proofs.
-pub(super) struct Proofs {
-    known: Mutex<Known>,
-    turn: Semaphore,
-}
-
-impl Default for Proofs {
-    fn default() -> Self {
-        Self { known: Mutex::default(), turn: Semaphore::new(1) }
-    }
-}
-
-impl Proofs {
-    /// Returns the stored result of a verification of the run `id`. `head` is the hash of the last record that the
-    /// plant has of this run. Returns `None` if there is no result from the last 60 s, or if the stored result is for
-    /// another `head`.
-    pub(super) fn known(&self, id: i32, head: &str) -> Option<Arc<Proof>> {
-        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        known.retain(|_, (since, ..)| since.elapsed() < LASTS);
-        known.get(&id).filter(|(_, at, _)| at == head).map(|(.., proof)| Arc::clone(proof))
-    }
-
-    fn keep(&self, id: i32, head: &str, proof: &Arc<Proof>) {
-        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        if known.len() >= KEPT {
-            let oldest = known.iter().min_by_key(|(_, (since, ..))| *since).map(|(id, _)| *id);
-            oldest.map(|id| known.remove(&id));
-        }
-        known.insert(id, (Instant::now(), head.to_owned(), Arc::clone(proof)));
-    }
-}
 
 /// Verifies the plant's copy of a run, or returns a result from the cache that is less than 60 s old. `id` is the id of
 /// the run in the plant, `cell` the name of its cell, and `name` the name of the run. `head` is the hash of the last

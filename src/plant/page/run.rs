@@ -16,10 +16,13 @@ use serde::Deserialize;
 use super::super::Row;
 use super::super::error::PlantError;
 use super::super::link::DatabaseLink;
-use super::proof::{Proof, proven};
+use super::content::{PageContent, page};
+use super::page_error::{PageError, unmade, within};
+use super::proof::proven;
+use super::proofs::Proof;
 use super::selection::mark;
+use super::shared::{PlantPage, Shared};
 use super::words::{encoded, shown, um};
-use super::{PageContent, PageError, PlantPage, Shared, page, unmade};
 
 /// Time that the page waits for the proof before it is shown without it, and seconds until the browser then retries.
 const WAITS: Duration = Duration::from_secs(3);
@@ -81,7 +84,7 @@ pub(super) async fn by_name(
         let missing = || PageError::NotHere(format!("the plant has no record of the run {name} of {cell} yet"));
         rows.first().map(|row| row.get::<_, i32>(0)).ok_or_else(missing)
     };
-    match super::within(found).await {
+    match within(found).await {
         Ok(id) => Redirect::to(&format!("/runs/{id}")).into_response(),
         Err(reason) => unmade(&session, &reason),
     }

@@ -8,7 +8,7 @@ use serde::Deserialize;
 
 use super::super::error::PlantError;
 use super::super::link::DatabaseLink;
-use super::PageError;
+use super::page_error::PageError;
 use super::words::{encoded, shown};
 
 /// Filters of parts: the column of the views, which is also the word in an address, and the label for people.

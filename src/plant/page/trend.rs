@@ -8,10 +8,12 @@ use regrind_page::Session;
 
 use super::super::error::PlantError;
 use super::super::link::DatabaseLink;
+use super::content::{PageContent, page};
 use super::control_chart::{ENOUGH, Limits, Value, individuals, moving_ranges};
+use super::page_error::PageError;
 use super::selection::{ALL_KINDS, Selection, SelectionQuery, mark};
+use super::shared::Shared;
 use super::words::{shown, um};
-use super::{PageContent, PageError, Shared, page};
 
 /// Maximum number of parts in a chart, and of parts in the list of those out of limits.
 const MAX_PARTS: i64 = 250;

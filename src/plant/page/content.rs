@@ -1,0 +1,24 @@
+//! Content of a page, and the HTML page that shows it.
+
+use axum::response::Response;
+use maud::Markup;
+use regrind_page::{Session, plant_document};
+
+use super::page_error::{PageError, unmade, within};
+use super::style::STYLE;
+
+/// Finished page.
+pub(super) struct PageContent {
+    pub(super) title: String,
+    pub(super) again_s: Option<u32>,
+    pub(super) main: Markup,
+}
+
+/// Returns the HTML page whose content the future `making` computes. If `making` fails, or takes longer than the time
+/// limit (15 s), returns a page with the reason. `session` is the session of the person who has signed in.
+pub(super) async fn page(session: &Session, making: impl Future<Output = Result<PageContent, PageError>>) -> Response {
+    match within(making).await {
+        Ok(PageContent { title, again_s, main }) => plant_document(&title, session, again_s, STYLE, main),
+        Err(reason) => unmade(session, &reason),
+    }
+}
