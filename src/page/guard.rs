@@ -23,10 +23,11 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use sha2::{Digest, Sha256};
 
-use super::sign_in::SignedIn;
+use super::rate::Rate;
+use super::sessions::SignedIn;
+use super::subject::PageSubject;
 use super::tls::Tls;
 use super::users::{Person, UsersFile};
-use super::view::{self, PageSubject};
 
 /// Cookies of a page; the port is part of their names, because a browser keeps one set for all pages of a computer.
 const KEY_COOKIE: &str = "regrind_key";
@@ -41,7 +42,6 @@ const TOKENS: usize = 1024;
 const WRONG_KEYS: u32 = 20;
 /// Maximum number of refusals that are logged within a minute. Further ones are only counted.
 const MAX_LOGGED_REFUSALS: u32 = 10;
-const MINUTE: Duration = Duration::from_secs(60);
 
 /// Names of the loopback address.
 const IS_LOOPBACK: [&str; 3] = ["localhost", "127.0.0.1", "[::1]"];
@@ -115,44 +115,6 @@ pub(crate) struct Guard {
 /// Function that logs messages that are recorded nowhere else.
 pub(crate) type LogSink = dyn Fn(&str) + Send + Sync;
 
-/// Number of occurrences of an event within a minute.
-pub(crate) struct Rate {
-    began: Instant,
-    count: u32,
-}
-
-impl Rate {
-    pub(crate) fn new() -> Self {
-        Self { began: Instant::now(), count: 0 }
-    }
-
-    pub(crate) fn is_over(&self) -> bool {
-        self.began.elapsed() > MINUTE
-    }
-
-    /// Returns the age of the current counting interval: the time since it began. The counted events are, for example,
-    /// refused requests or attempts to sign in. An interval lasts at least one minute. The next interval begins with
-    /// the first event after this minute.
-    pub(crate) fn age(&self) -> Duration {
-        self.began.elapsed()
-    }
-
-    /// Returns the number of events in the current counting interval. The counted events are, for example, refused
-    /// requests or attempts to sign in. An interval lasts at least one minute. The next interval begins with the first
-    /// event after this minute.
-    pub(crate) fn current_count(&self) -> u32 {
-        self.count
-    }
-
-    pub(crate) fn count(&mut self) -> u32 {
-        if self.is_over() {
-            *self = Self::new();
-        }
-        self.count += 1;
-        self.count
-    }
-}
-
 impl Guard {
     pub(crate) fn new(
         entrance: Entrance,
@@ -218,6 +180,70 @@ impl Guard {
         }
         let wrong = self.wrong.lock().unwrap_or_else(PoisonError::into_inner).count();
         (wrong <= WRONG_KEYS).then_some(false)
+    }
+
+    /// Checks the access of the client at the address `from`, which sends `request`. A client has access if it has signed
+    /// in or, on a page without a list of users, if it has the key. If the address contains the correct key, the
+    /// browser gets a redirection to the address without the key, and the key as a cookie. Records a wrong key, and an
+    /// order without access.
+    pub(crate) fn admit(&self, request: &Request, from: IpAddr) -> Result<Admission, Denied> {
+        let id = self.cookie(request.headers(), SESSION_COOKIE).map(str::to_owned);
+        if let Some(users) = &self.entrance.users {
+            let person = id.as_ref().and_then(|id| self.signed_in.person(id, users));
+            let session = id.zip(person).map(|(id, person)| Session { id, person: Some(person), from });
+            return session.map(Admission::Admitted).ok_or_else(|| self.not_signed_in(request));
+        }
+        if let Some(key) = key_in(request.uri().query()) {
+            return match self.is_key(key) {
+                Some(true) => Ok(Admission::Redirected(self.welcome(request))),
+                told => Err(self.shut_out(request, told)),
+            };
+        }
+        let told = self.cookie(request.headers(), KEY_COOKIE).map(|key| self.is_key(key));
+        let session = id.filter(|_| told == Some(Some(true))).map(|id| Session { id, person: None, from });
+        session.map(Admission::Admitted).ok_or_else(|| self.shut_out(request, told.unwrap_or(Some(false))))
+    }
+
+    /// Responds to a browser that gave the correct key in the address. Sets a cookie with the key and a cookie with the
+    /// browser session. Redirects the browser to the same address without the key. If the browser already has a valid key
+    /// cookie and a session, this session stays valid, so that all tabs of the browser share one session.
+    fn welcome(&self, request: &Request) -> Response {
+        let headers = request.headers();
+        let is_known = self.cookie(headers, KEY_COOKIE).is_some_and(|key| same(key, &self.key));
+        let session = match self.cookie(headers, SESSION_COOKIE).filter(|_| is_known) {
+            Some(session) => session.to_owned(),
+            None => match random_word() {
+                Ok(session) => session,
+                Err(_) => return StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+            },
+        };
+        let path = request.uri().path().to_owned();
+        let mut response = (StatusCode::SEE_OTHER, [(LOCATION, path)]).into_response();
+        self.set_cookie(response.headers_mut(), KEY_COOKIE, &self.key);
+        self.set_session(&mut response, &session);
+        response
+    }
+
+    /// Records the refusal of a client without a correct key, and returns its reason. `told` is the result of the check
+    /// of the key by [`Self::is_key`].
+    fn shut_out(&self, request: &Request, told: Option<bool>) -> Denied {
+        let gave = self.cookie(request.headers(), KEY_COOKIE).is_some() || key_in(request.uri().query()).is_some();
+        if gave || request.method() != "GET" {
+            let what = if gave { "a wrong key" } else { "an order without a key" };
+            self.record_refusal(&format!("{what} for {}", printable(request.uri().path())));
+        }
+        if told.is_none() { Denied::TooManyKeys } else { Denied::NoKey }
+    }
+
+    /// Records the refusal of an order from a browser at which nobody has signed in, and returns the reason.
+    fn not_signed_in(&self, request: &Request) -> Denied {
+        if request.method() != "GET" {
+            let path = printable(request.uri().path());
+            self.record_refusal(&format!(
+                "an order to the address {path} that is not allowed, because the person has not signed in"
+            ));
+        }
+        Denied::NotSignedIn
     }
 
     /// Creates a token with which the browser of `session` can give one order.
@@ -344,6 +370,26 @@ impl Session {
     }
 }
 
+/// Access of a client.
+pub(crate) enum Admission {
+    /// The client is authorised.
+    Admitted(Session),
+    /// The address contains the correct key: response that stores the key in a cookie and leads to the address without
+    /// the key.
+    Redirected(Response),
+}
+
+/// Reason why a client has no access. The view renders it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Denied {
+    /// The client has not given the correct key.
+    NoKey,
+    /// The client has given a wrong key, after too many wrong keys within a minute.
+    TooManyKeys,
+    /// Nobody has signed in at this browser.
+    NotSignedIn,
+}
+
 /// Middleware that checks the host of a request. Passes the request to `next` if it has exactly one `Host` header and
 /// this header names this page. Refuses every other request with the status 421 (misdirected request). Adds the
 /// security headers to each response.
@@ -378,38 +424,6 @@ pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Re
     response
 }
 
-/// Middleware that checks the access of a client. Passes the request to `next` if the client has signed in or, on a
-/// page without a list of users, if the client has the key. Any other client gets the sign-in page, or the page that
-/// asks for the key. If the address contains the correct key, redirects the browser to the address without the key and
-/// stores the key in a cookie.
-pub(crate) async fn let_in(
-    State(guard): State<Arc<Guard>>,
-    Extension(Peer(from, is_known)): Extension<Peer>,
-    mut request: Request,
-    next: Next,
-) -> Response {
-    let id = guard.cookie(request.headers(), SESSION_COOKIE).map(str::to_owned);
-    let session = if let Some(users) = &guard.entrance.users {
-        let person = id.as_ref().and_then(|id| guard.signed_in.person(id, users));
-        id.zip(person).map(|(id, person)| Session { id, person: Some(person), from })
-    } else {
-        if let Some(key) = key_in(request.uri().query()) {
-            return match guard.is_key(key) {
-                Some(true) => welcome(&guard, &request),
-                told => shut_out(&guard, &request, told),
-            };
-        }
-        let told = guard.cookie(request.headers(), KEY_COOKIE).map(|key| guard.is_key(key));
-        let known = id.filter(|_| told == Some(Some(true)));
-        let Some(id) = known else { return shut_out(&guard, &request, told.unwrap_or(Some(false))) };
-        Some(Session { id, person: None, from })
-    };
-    let Some(session) = session else { return not_signed_in(&guard, &request) };
-    is_known();
-    request.extensions_mut().insert(session);
-    next.run(request).await
-}
-
 /// Answers with a new token for the next order of the browser.
 pub(crate) async fn token(State(guard): State<Arc<Guard>>, Extension(session): Extension<Session>) -> Response {
     match guard.give_token(&session) {
@@ -435,46 +449,6 @@ pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> 
         (!guard.takes_token(session, token))
             .then(|| "an order that is not allowed, because its token of this page is missing or was already used; load the page again in the browser".into())
     })
-}
-
-/// Responds to a browser that gave the correct key in the address. Sets a cookie with the key and a cookie with the
-/// browser session. Redirects the browser to the same address without the key. If the browser already has a valid key
-/// cookie and a session, this session stays valid, so that all tabs of the browser share one session.
-fn welcome(guard: &Guard, request: &Request) -> Response {
-    let headers = request.headers();
-    let is_known = guard.cookie(headers, KEY_COOKIE).is_some_and(|key| same(key, &guard.key));
-    let session = match guard.cookie(headers, SESSION_COOKIE).filter(|_| is_known) {
-        Some(session) => session.to_owned(),
-        None => match random_word() {
-            Ok(session) => session,
-            Err(_) => return StatusCode::INTERNAL_SERVER_ERROR.into_response(),
-        },
-    };
-    let path = request.uri().path().to_owned();
-    let mut response = (StatusCode::SEE_OTHER, [(LOCATION, path)]).into_response();
-    guard.set_cookie(response.headers_mut(), KEY_COOKIE, &guard.key);
-    guard.set_session(&mut response, &session);
-    response
-}
-
-fn shut_out(guard: &Guard, request: &Request, told: Option<bool>) -> Response {
-    let gave = guard.cookie(request.headers(), KEY_COOKIE).is_some() || key_in(request.uri().query()).is_some();
-    if gave || request.method() != "GET" {
-        let what = if gave { "a wrong key" } else { "an order without a key" };
-        guard.record_refusal(&format!("{what} for {}", printable(request.uri().path())));
-    }
-    let status = if told.is_none() { StatusCode::TOO_MANY_REQUESTS } else { StatusCode::UNAUTHORIZED };
-    view::key_needed(status, guard.subject, request.headers())
-}
-
-fn not_signed_in(guard: &Guard, request: &Request) -> Response {
-    if request.method() != "GET" {
-        let path = printable(request.uri().path());
-        guard.record_refusal(&format!(
-            "an order to the address {path} that is not allowed, because the person has not signed in"
-        ));
-    }
-    view::sign_in(StatusCode::UNAUTHORIZED, guard.subject, request.headers(), None)
 }
 
 fn key_in(query: Option<&str>) -> Option<&str> {

@@ -5,13 +5,13 @@ use std::net::IpAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use axum::Router;
 use axum::extract::{DefaultBodyLimit, Request, State};
 use axum::http::header::CONNECTION;
 use axum::http::{HeaderMap, StatusCode};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
+use axum::{Extension, Router};
 use hyper::body::Incoming;
 use hyper::service::{Service, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
@@ -21,10 +21,10 @@ use tokio::net::TcpListener;
 use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
 
-use super::guard::{self, Entrance, Guard, Peer};
-use super::sign_in::place;
-use super::view::{self, PageSubject};
-use super::{assets, sign_in};
+use super::guard::{self, Admission, Entrance, Guard, Peer};
+use super::sessions::place;
+use super::subject::PageSubject;
+use super::{assets, sign_in, view};
 
 /// Maximum number of simultaneous connections: of authorised clients, of clients that are not yet authorised, and of
 /// the latter from one address.
@@ -201,12 +201,33 @@ fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
         .fallback(async |State(guard): State<Arc<Guard>>, headers: HeaderMap| view::not_here(guard.subject, &headers))
         .with_state(Arc::clone(&guard));
     own.merge(routes)
-        .layer(from_fn_with_state(Arc::clone(&guard), guard::let_in))
+        .layer(from_fn_with_state(Arc::clone(&guard), let_in))
         .route("/sign-in", post(sign_in::sign_in).with_state(Arc::clone(&guard)))
         .route("/assets/{name}", get(assets::asset))
         .layer(from_fn_with_state(guard, guard::names_this_page))
         .layer(DefaultBodyLimit::max(LONGEST_BODY))
         .layer(from_fn(in_time))
+}
+
+/// Middleware that checks the access of a client. Passes the request to `next` if the client has signed in or, on a
+/// page without a list of users, if the client has the key. Any other client gets the sign-in page, or the page that
+/// asks for the key. If the address contains the correct key, redirects the browser to the address without the key and
+/// stores the key in a cookie.
+async fn let_in(
+    State(guard): State<Arc<Guard>>,
+    Extension(Peer(from, is_known)): Extension<Peer>,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    match guard.admit(&request, from) {
+        Ok(Admission::Admitted(session)) => {
+            is_known();
+            request.extensions_mut().insert(session);
+            next.run(request).await
+        }
+        Ok(Admission::Redirected(response)) => response,
+        Err(denied) => view::denied(denied, guard.subject, request.headers()),
+    }
 }
 
 /// Middleware with a timeout for requests that change something, such as POST. If the response to such a request does

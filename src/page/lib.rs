@@ -18,16 +18,20 @@ mod guarded_server;
 mod history;
 mod live;
 mod orders;
+mod rate;
+mod sessions;
 mod shape;
+mod shared;
 mod sign_in;
 mod stream;
+mod subject;
 mod texts;
 mod tls;
 mod users;
 mod view;
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use axum::Router;
@@ -36,27 +40,16 @@ use tokio::net::TcpListener;
 
 pub use guard::{Entrance, Session};
 pub use guarded_server::GuardedServer;
+pub use shared::{Page, PlannedPoints};
+pub use subject::PageSubject;
 pub use tls::{Tls, TlsError};
 pub use users::{PageRole, Person, Users, UsersError, UsersFile};
-pub use view::{PageSubject, plant_document};
+pub use view::plant_document;
 
 use guard::Guard;
 use history::History;
 use live::RunWatcher;
-
-/// Function that returns the planned points of a run in touching order: x and y in millimetres, model frame.
-pub type PlannedPoints = dyn Fn(&Path) -> Option<Vec<[f64; 2]>> + Send + Sync;
-
-/// Page of a cell with its state.
-pub struct Page {
-    guard: Arc<Guard>,
-    run_watcher: RunWatcher,
-    history: Arc<History>,
-    planned: Box<PlannedPoints>,
-}
-
-/// State that all request handlers share.
-type Shared = Arc<Page>;
+use shared::Shared;
 
 impl Page {
     /// Creates the page for the runs in the folder `runs`. `entrance` contains the address and the access rules of the

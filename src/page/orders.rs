@@ -18,9 +18,9 @@ use regrind_control::{OnBehalf, Reply, Request, send_request_on_behalf};
 use serde::Serialize;
 use tokio::task::{JoinHandle, spawn_blocking};
 
-use super::Shared;
 use super::guard::{Session, foreign};
 use super::history::History;
+use super::shared::Shared;
 use super::users::PageRole;
 
 /// Answer of the page to an order.

@@ -18,7 +18,7 @@ use regrind_formats::{DeviationRow, FormatError, MapNode, read_deviations, read_
 use regrind_report::CycleSummary;
 use tokio::task::spawn_blocking;
 
-use super::Shared;
+use super::shared::Shared;
 
 /// Maximum number of nodes of a map that is drawn.
 const MAX_NODES: usize = 4 << 20;

@@ -12,9 +12,9 @@ use futures_util::stream::unfold;
 use serde_json::{Map, Value, json};
 use tokio::sync::watch::Receiver;
 
-use super::Shared;
 use super::guard::Session;
 use super::live::ObservedRun;
+use super::shared::Shared;
 use super::texts::Language;
 use super::view::{self, Piece};
 

@@ -14,12 +14,13 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::task::spawn_blocking;
 
-use super::Shared;
 use super::alarms::alarm_texts;
 use super::chart::chart;
-use super::guard::{Session, text};
+use super::guard::{Denied, Session, text};
 use super::history::Listed;
 use super::live::{ObservedRun, verdict};
+use super::shared::Shared;
+use super::subject::PageSubject;
 use super::texts::{self, Language, Text};
 use super::users::Person;
 
@@ -690,10 +691,21 @@ pub(crate) fn not_here(of: PageSubject, headers: &HeaderMap) -> Response {
         .into_response()
 }
 
+/// Returns the page for a client without access. `reason` decides what the page asks for: the key, or a sign-in. `of`
+/// says whether the server shows one cell or the plant; it determines the links at the top of the page. `headers` are
+/// the headers of the request; they determine the language.
+pub(crate) fn denied(reason: Denied, of: PageSubject, headers: &HeaderMap) -> Response {
+    match reason {
+        Denied::NoKey => key_needed(StatusCode::UNAUTHORIZED, of, headers),
+        Denied::TooManyKeys => key_needed(StatusCode::TOO_MANY_REQUESTS, of, headers),
+        Denied::NotSignedIn => sign_in(StatusCode::UNAUTHORIZED, of, headers, None),
+    }
+}
+
 /// Returns the page on which a person enters the access key. A client without a valid key gets this page. `status` is
 /// the HTTP status of the response. `of` says whether the server shows one cell or the plant; it determines the links
 /// at the top of the page. `headers` are the headers of the request; they determine the language.
-pub(crate) fn key_needed(status: StatusCode, of: PageSubject, headers: &HeaderMap) -> Response {
+fn key_needed(status: StatusCode, of: PageSubject, headers: &HeaderMap) -> Response {
     let language = language(headers);
     let main = html! {
         main .list {
@@ -733,15 +745,6 @@ struct Frame<'a> {
     /// Person who has signed in.
     person: Option<&'a Person>,
     kind: Kind<'a>,
-}
-
-/// Subject of a page. It decides the links at the top of the page.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum PageSubject {
-    /// One cell and its runs.
-    Cell,
-    /// All cells of a plant. This page is in English.
-    Plant,
 }
 
 /// Kind of a page: which scripts and styles it needs.
