@@ -8,6 +8,7 @@ mod cell_monitor;
 mod check;
 mod choice;
 mod compensate;
+mod completeness;
 mod control;
 mod doctor;
 mod failure;
@@ -16,7 +17,9 @@ mod initial;
 mod key;
 mod live;
 mod nominal;
+mod outcome;
 mod outside;
+mod parsers;
 mod plan;
 #[cfg(feature = "plant")]
 mod plant;
@@ -32,6 +35,7 @@ mod run;
 #[cfg(feature = "plant")]
 mod run_queue;
 mod runs;
+mod runtime;
 mod schema;
 mod serve;
 mod shell;
@@ -40,6 +44,7 @@ mod simulate;
 mod simulated;
 mod states;
 mod succession;
+mod terminal;
 mod users;
 mod watch;
 mod words;
@@ -47,11 +52,14 @@ mod words;
 use std::io::{self, Write};
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 
-use failure::Failure;
-use regrind::document::{countable, misleading, visible};
+use outcome::Outcome;
+use parsers::{above_zero, finite_above_zero, finite_from_zero, name, remark};
+use regrind::document::{countable, visible};
 use regrind::drive::Request;
+use runtime::runtime;
+use terminal::{print, print_json};
 
 /// Closed-loop grinding: register measured probe centres to the offset of a nominal surface.
 #[derive(Debug, Parser)]
@@ -112,15 +120,6 @@ enum Command {
 
 const EXIT_CODES: &str = "Exit codes: 0 accepted; 1 finished, not in tolerance; 2 bad arguments or data; 3 fault.";
 
-/// Outcome of a successful command.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Outcome {
-    Accepted,
-    NotInTolerance,
-    /// The inspected run is active and has not ended.
-    UnderWay,
-}
-
 /// Parses the arguments, runs the command, and returns the exit code.
 pub fn main() -> ExitCode {
     std::panic::set_hook(Box::new(|panic| {
@@ -175,8 +174,8 @@ fn run() -> ExitCode {
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Schema(arguments) => schema::run(&arguments),
         Command::States(arguments) => states::run(&arguments),
-        Command::Completions(arguments) => shell::completions(&arguments),
-        Command::Man(arguments) => shell::pages(&arguments),
+        Command::Completions(arguments) => shell::completions(&arguments, Arguments::command()),
+        Command::Man(arguments) => shell::pages(&arguments, Arguments::command()),
     };
     match ended {
         Ok(Outcome::Accepted) => ExitCode::SUCCESS,
@@ -189,82 +188,12 @@ fn run() -> ExitCode {
     }
 }
 
-/// Creates the tokio runtime that executes asynchronous commands.
-fn runtime() -> Result<tokio::runtime::Runtime, Failure> {
-    tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().map_err(Failure::Terminal)
-}
-
-/// Prints text to standard output. It is not an error if the program that reads the output has ended.
-fn print(text: &str) -> Result<(), Failure> {
-    let mut out = io::stdout().lock();
-    // A question has no line end, so it needs a flush.
-    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Failure::Terminal(error)),
-        _ => Ok(()),
-    }
-}
-
-/// Writes a value to the terminal as indented JSON.
-fn print_json(value: &impl serde::Serialize) -> Result<(), Failure> {
-    let mut text = serde_json::to_string_pretty(value).map_err(|e| Failure::Terminal(e.into()))?;
-    text.push('\n');
-    print(&text)
-}
-
-/// Checks that `text` can be the name of a person, a part or a place. Returns the name without spaces at both ends.
-/// Returns the reason as text if the name is empty or longer than 300 characters. Also returns the reason if the name
-/// has characters that are invisible or that change the order of the letters.
-fn name(text: &str) -> Result<String, String> {
-    const LONGEST: usize = 300;
-    match (misleading(text), text.trim()) {
-        (Some(hidden), _) => Err(format!(
-            "the text has the character U+{:04X}, which is invisible or changes the order of the letters; type the text again",
-            u32::from(hidden)
-        )),
-        (None, "") => Err("it is empty".into()),
-        (None, name) if name.chars().count() > LONGEST => Err(format!("it is longer than {LONGEST} characters")),
-        (None, name) => Ok(name.to_owned()),
-    }
-}
-
-/// Checks that `text` can be the remark of a person. Returns the remark without spaces at both ends; the remark can be
-/// empty. Returns the reason as text if the remark has invisible characters or is longer than 300 characters.
-fn remark(text: &str) -> Result<String, String> {
-    if text.trim().is_empty() { Ok(String::new()) } else { name(text) }
-}
-
-/// Parses `text` as a number above 0. Accepts `inf` (infinity). Returns a text with the permitted values if `text` is
-/// not such a number.
-fn above_zero(text: &str) -> Result<f64, String> {
-    match text.trim().parse::<f64>() {
-        Ok(value) if value > 0.0 => Ok(value),
-        _ => Err("give a number above 0; the decimal mark is a point, not a comma".into()),
-    }
-}
-
-/// Parses `text` as a finite number above 0. Returns a text with the permitted values if `text` is not such a number.
-fn finite_above_zero(text: &str) -> Result<f64, String> {
-    above_zero(text).and_then(|v| if v.is_finite() { Ok(v) } else { Err("give a finite number above 0".into()) })
-}
-
-/// Parses `text` as a finite number that is 0 or above. Returns a text with the permitted values if `text` is not such
-/// a number.
-fn finite_from_zero(text: &str) -> Result<f64, String> {
-    match text.trim().parse::<f64>() {
-        Ok(value) if value >= 0.0 && value.is_finite() => Ok(value.abs()),
-        _ => Err(
-            "give a finite number above 0, or 0 for a probe without a ball; the decimal mark is a point, not a comma"
-                .into(),
-        ),
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
+    use super::*;
 
     #[test]
     fn the_arguments_are_consistent() {
-        super::Arguments::command().debug_assert();
+        Arguments::command().debug_assert();
     }
 }

@@ -1,6 +1,6 @@
 //! `regrind recover`: brings machines to idle that hold jobs unknown to any run.
 
-use std::io::{self, BufRead};
+use std::io;
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
@@ -17,7 +17,7 @@ use super::failure::Failure;
 use super::live::{lock_machine, owner};
 use super::run::{epoch, free_folder, operator};
 use super::succession::RunPlace;
-use super::{Outcome, check, control, key};
+use super::{Outcome, check, control, key, terminal};
 
 /// Bring machines of a cell to idle that hold a job which no run knows
 #[derive(Args, Debug)]
@@ -154,7 +154,7 @@ impl Recovery {
                 step.name(),
                 step.consequence(device)
             ))?;
-            if answer()? != step.name() {
+            if terminal::answer()? != step.name() {
                 super::print("no command was sent; the machine stays in this state\n")?;
                 return Ok(false);
             }
@@ -190,11 +190,4 @@ impl Recovery {
         super::print(&format!("record in {}\n", self.folder.display()))?;
         if home == [true, true] { Ok(Outcome::Accepted) } else { Err(Failure::NotHome) }
     }
-}
-
-/// Reads a line from standard input, trimmed. The end of the input gives an empty answer.
-pub(super) fn answer() -> Result<String, Failure> {
-    let mut line = String::new();
-    io::stdin().lock().read_line(&mut line).map_err(Failure::Terminal)?;
-    Ok(line.trim().to_owned())
 }

@@ -73,7 +73,7 @@ pub(super) struct Arguments {
     /// Part from the queue of the plant that this run makes
     #[cfg(feature = "plant")]
     #[arg(skip)]
-    pub(super) work: Option<Box<super::run_queue::ConfirmedPart>>,
+    pub(super) work: Option<Box<super::plant::ConfirmedPart>>,
     /// File for the true state of the simulated part at the end
     #[cfg(feature = "plant")]
     #[arg(long, hide = true)]

@@ -13,7 +13,8 @@ use regrind::recipe::Recipe;
 use regrind_plant::{DatabaseLink, LEASE, Lease, PlantError, PlantRecipe, StartedPart};
 
 use super::failure::Failure;
-use super::{Outcome, check, plant, recover, run as making};
+use super::plant::ConfirmedPart;
+use super::{Outcome, check, plant, run as making, terminal};
 
 /// Time between two queries of the queue with `--wait`.
 const ROUND: Duration = Duration::from_secs(5);
@@ -75,33 +76,6 @@ pub(super) struct Arguments {
     /// Print a line of JSON for each event of a run
     #[arg(long)]
     json: bool,
-}
-
-/// Confirmed part, before its run begins.
-#[derive(Clone, Debug)]
-pub(super) struct ConfirmedPart {
-    config: PlantConfig,
-    lease: Lease,
-}
-
-impl ConfirmedPart {
-    /// Tells the plant that the leased part (the part reserved for this cell) is made by the run in the folder `run`.
-    /// Returns after the plant has confirmed this assignment. The run must not begin earlier. If the answer of the
-    /// plant is lost, repeats the request once. Returns an error if the plant refuses the assignment or cannot be
-    /// reached.
-    pub(super) async fn begin(&self, run: &Path) -> Result<(), Failure> {
-        let name = run.file_name().unwrap_or_default().to_string_lossy();
-        let link = plant::open(&self.config).await?;
-        match self.lease.begin(&link, &name).await {
-            // It is unknown whether the plant made the assignment. The request is idempotent: a retry returns the same
-            // answer.
-            Err(error) if error.may_pass() => {
-                let link = plant::open(&self.config).await?;
-                Ok(self.lease.begin(&link, &name).await?)
-            }
-            other => Ok(other?),
-        }
-    }
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
@@ -218,7 +192,7 @@ async fn confirmed(
     super::print(
         "  type or scan the serial number to start this part; any other input returns the part to the queue: ",
     )?;
-    let mut answer = tokio::task::spawn_blocking(recover::answer);
+    let mut answer = tokio::task::spawn_blocking(terminal::answer);
     loop {
         tokio::select! {
             typed = &mut answer => return Ok(typed.map_err(|error| Failure::Terminal(error.into()))?? == lease.serial),

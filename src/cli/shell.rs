@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Command, CommandFactory};
+use clap::{Args, Command};
 use clap_complete::Shell;
 use clap_mangen::Man;
 use regrind::formats::{ResultFolder, write_atomic};
@@ -40,26 +40,28 @@ pub(super) struct Pages {
     out: PathBuf,
 }
 
-pub(super) fn completions(arguments: &Completions) -> Result<Outcome, Failure> {
+/// Prints the completion script for the commands of `program`.
+pub(super) fn completions(arguments: &Completions, mut program: Command) -> Result<Outcome, Failure> {
     let mut script = Vec::new();
-    clap_complete::generate(arguments.shell, &mut super::Arguments::command(), "regrind", &mut script);
+    clap_complete::generate(arguments.shell, &mut program, "regrind", &mut script);
     super::print(&String::from_utf8_lossy(&script))?;
     Ok(Outcome::Accepted)
 }
 
-pub(super) fn pages(arguments: &Pages) -> Result<Outcome, Failure> {
+/// Writes the manual pages of the commands of `program`.
+pub(super) fn pages(arguments: &Pages, program: Command) -> Result<Outcome, Failure> {
     let folder = ResultFolder::prepare(&arguments.out)?;
-    for (name, page) in manual() {
+    for (name, page) in manual(program) {
         write_atomic(&arguments.out.join(name), &page)?;
     }
     folder.keep();
     Ok(Outcome::Accepted)
 }
 
-/// Returns the manual page of each command that is not hidden. Each entry contains the file name, such as
+/// Returns the manual page of `program` and of each of its commands that is not hidden. Each entry contains the file name, such as
 /// `regrind-run.1`, and the content.
-fn manual() -> Vec<(String, Vec<u8>)> {
-    let mut program = super::Arguments::command().disable_help_subcommand(true);
+fn manual(program: Command) -> Vec<(String, Vec<u8>)> {
+    let mut program = program.disable_help_subcommand(true);
     program.build();
     let mut pages = Vec::new();
     gather(&program, "regrind", &mut pages);

@@ -14,7 +14,7 @@ use regrind::record::{PreviousRun, begin_of};
 use serde_json::{Value, json};
 
 use super::Outcome;
-use super::audit::is_whole;
+use super::completeness::is_whole;
 use super::control::folders;
 use super::failure::Failure;
 

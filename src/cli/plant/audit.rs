@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 
 use super::super::control::folder_of;
 use super::super::failure::Failure;
-use super::{open, read};
+use super::plant_file::{open, read};
 
 /// Result of the verification of the plant's copy of a run.
 pub(in super::super) struct Copy {

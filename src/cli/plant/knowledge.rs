@@ -9,6 +9,7 @@ use regrind::formats::Learned;
 use regrind_plant::Knowledge;
 
 use super::super::failure::Failure;
+use super::plant_file::{open, read};
 
 /// Timeout for the plant, after which a run begins without its knowledge.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -29,7 +30,7 @@ pub(in super::super) struct PlantKnowledge {
 ///
 /// Returns an error only if the plant file is invalid.
 pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<PlantKnowledge, Failure> {
-    let config = super::read(plant)?;
+    let config = read(plant)?;
     // A plant file for live values only has no database to query.
     if config.database.is_none() {
         return Ok(PlantKnowledge::default());
@@ -41,7 +42,7 @@ pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<Pla
     std::thread::spawn(move || {
         let asked = super::super::runtime().and_then(|runtime| {
             runtime.block_on(async {
-                let link = super::open(&config).await?;
+                let link = open(&config).await?;
                 let of_this = (kind.as_str(), simulation);
                 let knowledge = Knowledge::query(&link, config.artefacts.as_ref(), of_this).await?;
                 let alike = alike(&knowledge, config.machines_differ);

@@ -10,7 +10,7 @@ use serde_json::json;
 
 use super::super::failure::Failure;
 use super::super::{Outcome, key, name};
-use super::{Where, open, open_any};
+use super::plant_file::{Where, open, open_any};
 
 /// Set up the database, or update it to this program's layout, as its owner
 #[derive(Args, Debug)]

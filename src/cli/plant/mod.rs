@@ -1,8 +1,10 @@
 //! `regrind plant`: the database of many cells, its members and its content.
 
 pub(super) mod audit;
+mod confirmed_part;
 pub(super) mod knowledge;
 mod members;
+mod plant_file;
 mod queue;
 mod recipes;
 mod runs;
@@ -12,12 +14,12 @@ pub(super) mod studies;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use clap::{Args, Subcommand};
-use regrind::config::PlantConfig;
-use regrind_plant::{DatabaseLink, DatabaseSettings};
-
+use super::Outcome;
 use super::failure::Failure;
-use super::{Outcome, check};
+use clap::{Args, Subcommand};
+pub(super) use confirmed_part::ConfirmedPart;
+use plant_file::Where;
+pub(super) use plant_file::{open, read};
 pub(super) use recipes::is_below;
 
 /// Manage the database of a plant of many cells
@@ -75,52 +77,6 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         PlantCommand::Work(of) => queue::list(of),
         PlantCommand::Serve(of) => serve::serve(of),
     }
-}
-
-/// Plant to use.
-#[derive(Args, Clone, Debug)]
-pub(super) struct Where {
-    /// Plant file: address and user of the database
-    #[arg(long = "plant", value_name = "FILE")]
-    file: PathBuf,
-}
-
-impl Where {
-    pub(super) fn read(&self) -> Result<PlantConfig, Failure> {
-        read(&self.file)
-    }
-}
-
-/// Reads a plant file. If it is invalid, prints its problems and returns a failure.
-pub(super) fn read(file: &Path) -> Result<PlantConfig, Failure> {
-    check::or_show(PlantConfig::read(file))
-}
-
-/// Returns the table `[database]` of a plant file. If there is none, prints this problem and returns a failure.
-fn database(config: &PlantConfig) -> Result<&DatabaseSettings, Failure> {
-    let missing = || {
-        config.problem(
-            "database",
-            "is missing",
-            "",
-            "add the table [database] with the address of the database and the user that signs in",
-        )
-    };
-    check::or_show(config.database.as_ref().ok_or_else(missing))
-}
-
-/// Signs in to the database that the plant file names, without a check of the table layout (version of the tables) in
-/// this database. Returns an error if the plant file names no database, or if the sign-in fails.
-pub(super) async fn open_any(config: &PlantConfig) -> Result<DatabaseLink, Failure> {
-    Ok(DatabaseLink::open(database(config)?).await?)
-}
-
-/// Signs in to the database that the plant file names, and checks the table layout (version of the tables) in this
-/// database. Returns an error if the sign-in fails, or if this program does not support the layout.
-pub(super) async fn open(config: &PlantConfig) -> Result<DatabaseLink, Failure> {
-    let link = open_any(config).await?;
-    regrind_plant::check_layout(link.client()).await?;
-    Ok(link)
 }
 
 /// Programs that replicate and publish a run for the plant while it is active. They are separate processes, so they can

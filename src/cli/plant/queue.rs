@@ -6,7 +6,7 @@ use serde_json::json;
 
 use super::super::failure::Failure;
 use super::super::{Outcome, name};
-use super::{Where, open};
+use super::plant_file::{Where, open};
 
 /// Queue parts to make by a recipe
 #[derive(Args, Debug)]

@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::super::failure::Failure;
 use super::super::{Outcome, check, name};
-use super::{Where, open};
+use super::plant_file::{Where, open};
 
 /// Propose a recipe to the plant, as the next version under its name
 #[derive(Args, Debug)]

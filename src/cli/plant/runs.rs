@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::super::Outcome;
 use super::super::failure::Failure;
-use super::{Where, open};
+use super::plant_file::{Where, open};
 
 /// List the newest runs of all cells, or those of one part
 #[derive(Args, Debug)]

@@ -9,7 +9,7 @@ use regrind_plant::PlantPage;
 use super::super::Outcome;
 use super::super::failure::Failure;
 use super::super::serve::PageAccess;
-use super::Where;
+use super::plant_file::{Where, database, open};
 
 /// Default address of the page. Its port is one above that of the page of a cell.
 const ADDRESS: &str = "127.0.0.1:7374";
@@ -41,9 +41,9 @@ pub(super) struct Arguments {
 pub(super) fn serve(arguments: &Arguments) -> Result<Outcome, Failure> {
     let Arguments { listen, door, plant } = arguments;
     let config = plant.read()?;
-    let settings = super::database(&config)?.clone();
+    let settings = database(&config)?.clone();
     super::super::runtime()?.block_on(async {
-        match super::open(&config).await {
+        match open(&config).await {
             Ok(_) => {}
             Err(Failure::Plant(error)) if error.may_pass() => {
                 eprintln!("page: {error}; the page waits for the database")

@@ -14,8 +14,8 @@ use serde_json::{Map, Value, json};
 use super::super::failure::Failure;
 use super::super::words::three_digits;
 use super::super::{Outcome, check, name, outside};
-use super::recipes::files_of;
-use super::{Where, is_below, open};
+use super::plant_file::{Where, open};
+use super::recipes::{files_of, is_below};
 
 /// Time between two queries of a worker while there is no job.
 const ROUND: Duration = Duration::from_secs(5);
