@@ -1,6 +1,7 @@
 //! `regrind audit`: verifies that the record of a run is unchanged, and prints it.
 
 use std::io::{self, Write};
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
@@ -16,8 +17,7 @@ use super::completeness::is_whole;
 use super::control::{folder_of, folders};
 use super::failure::Failure;
 use super::key;
-#[cfg(feature = "plant")]
-use super::plant::audit as plant;
+use super::plant;
 use super::succession;
 
 /// Verify, show or export the record of a run; create the key that signs it
@@ -72,11 +72,8 @@ struct ToVerify {
     /// Accepted public key, or the file with it; repeat the option for a run that another computer continued
     #[arg(long, value_name = "PUBLIC|FILE", value_parser = key::public)]
     key: Vec<PublicKey>,
-    /// Also verify the copy at the plant of this file, and compare the journal with it; RUN may then be the name of a
-    /// run that is not on this computer
-    #[cfg(feature = "plant")]
-    #[arg(long, value_name = "FILE", conflicts_with = "anchor")]
-    plant: Option<PathBuf>,
+    #[command(flatten)]
+    plant: plant::AuditArguments,
     /// Print JSON instead of text
     #[arg(long)]
     json: bool,
@@ -169,16 +166,10 @@ fn failure(error: JournalError) -> Failure {
 }
 
 fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
-    #[cfg(feature = "plant")]
-    let copy = match &arguments.plant {
-        None => None,
-        Some(plant) => match plant::prove(plant, arguments.run.as_deref(), &arguments.key, arguments.json)? {
-            copy if !copy.is_here => return Ok(Outcome::Accepted),
-            copy => Some(copy.content),
-        },
+    let copy = match arguments.plant.prove(arguments.run.as_deref(), &arguments.key, arguments.json)? {
+        ControlFlow::Continue(copy) => copy,
+        ControlFlow::Break(outcome) => return Ok(outcome),
     };
-    #[cfg(not(feature = "plant"))]
-    let copy: Option<serde_json::Value> = None;
     let folder = folder_of(arguments.run.as_deref())?;
     if is_folder_of_runs(&folder) {
         if let Some(anchor) = &arguments.anchor {

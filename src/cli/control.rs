@@ -278,13 +278,6 @@ pub(super) fn live_or(runs: &Path, otherwise: fn(&Path) -> Option<PathBuf>) -> R
     }
 }
 
-/// Returns the folders of the active runs in the folder `runs`. A run is active if a cell listens for orders at the
-/// control socket in the run folder.
-#[cfg(feature = "plant")]
-pub(super) fn live_runs(runs: &Path) -> impl Iterator<Item = PathBuf> {
-    folders(runs).filter(|folder| is_live(folder))
-}
-
 pub(super) fn folders(runs: &Path) -> impl Iterator<Item = PathBuf> {
     let entries = std::fs::read_dir(runs).into_iter().flatten().filter_map(io::Result::ok);
     // A hidden entry is kept next to the runs and is not a run.

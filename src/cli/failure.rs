@@ -12,16 +12,10 @@ use regrind::registration::RegistrationError;
 use regrind::report::ReportError;
 use regrind::setup::SetupError;
 use regrind::surface::{DefinitionError, SurfaceError};
-#[cfg(feature = "plant")]
-use regrind_plant::PlantError;
 use thiserror::Error;
 
-/// Exit code for a failed check: a broken or incomplete record, a copy that differs from it, or unfinished work.
-const NOT_AS_IT_SHOULD_BE: u8 = 1;
-/// Exit code for invalid arguments, recipe or data.
-const BAD_INPUT: u8 = 2;
-/// Exit code for a fault of the machine or of the program.
-pub(super) const FAULT: u8 = 3;
+use super::outcome::{BAD_INPUT, FAULT, NOT_AS_IT_SHOULD_BE};
+use super::plant::PlantFailure;
 
 /// Reason why a command ended without a result.
 #[derive(Debug, Error)]
@@ -136,21 +130,8 @@ pub(super) enum Failure {
     Tls(#[from] regrind_page::TlsError),
     #[error(transparent)]
     Users(#[from] regrind_page::UsersError),
-    #[cfg(feature = "plant")]
-    #[error("{reason}")]
-    OpenWork { reason: String },
-    #[cfg(feature = "plant")]
-    #[error(
-        "{}: this file cannot be read: {source}; check that the file exists, and that you have the right to read the file",
-        .path.display()
-    )]
-    Unreadable { path: PathBuf, source: io::Error },
-    #[cfg(feature = "plant")]
     #[error(transparent)]
-    Plant(Box<PlantError>),
-    #[cfg(feature = "plant")]
-    #[error(transparent)]
-    Live(#[from] regrind_live::LiveError),
+    Plant(#[from] PlantFailure),
     #[error("{}: there is no user {name:?}; to see all users: `regrind users list`", .path.display())]
     NoUser { name: String, path: PathBuf },
     #[error("the two passwords differ; nothing was changed")]
@@ -236,14 +217,6 @@ pub(super) enum Failure {
     Terminal(io::Error),
 }
 
-#[cfg(feature = "plant")]
-impl From<PlantError> for Failure {
-    fn from(error: PlantError) -> Self {
-        // Boxed because it is large and rare.
-        Self::Plant(Box::new(error))
-    }
-}
-
 impl Failure {
     /// Returns the failure to report if the cell of the run in `folder` did not answer a request. `source` is the error
     /// of the connection, and its kind selects the failure:
@@ -287,20 +260,7 @@ impl Failure {
             | Self::RunsLack { .. }
             | Self::MayBeLost { .. }
             | Self::Report(ReportError::Record(JournalError::Broken { .. })) => NOT_AS_IT_SHOULD_BE,
-            #[cfg(feature = "plant")]
-            Self::OpenWork { .. } => NOT_AS_IT_SHOULD_BE,
-            #[cfg(feature = "plant")]
-            Self::Plant(error) if error.may_pass() => FAULT,
-            #[cfg(feature = "plant")]
-            Self::Plant(error)
-                if matches!(
-                    **error,
-                    PlantError::Differs { .. }
-                        | PlantError::Journal(JournalError::Broken { .. } | JournalError::NoAuthor { .. })
-                ) =>
-            {
-                NOT_AS_IT_SHOULD_BE
-            }
+            Self::Plant(failure) => failure.exit_code(),
             _ => BAD_INPUT,
         }
     }

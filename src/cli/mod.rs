@@ -3,8 +3,6 @@
 mod accuracy;
 mod audit;
 mod blocks;
-#[cfg(feature = "plant")]
-mod cell_monitor;
 mod check;
 mod choice;
 mod compensate;
@@ -23,17 +21,14 @@ mod parsers;
 mod plan;
 #[cfg(feature = "plant")]
 mod plant;
-#[cfg(feature = "plant")]
-mod publish;
+#[cfg(not(feature = "plant"))]
+#[path = "plant/absent.rs"]
+mod plant;
 mod recover;
 mod register;
-#[cfg(feature = "plant")]
-mod replicate;
 mod report;
 mod resume;
 mod run;
-#[cfg(feature = "plant")]
-mod run_queue;
 mod runs;
 mod runtime;
 mod schema;
@@ -54,7 +49,7 @@ use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser, Subcommand};
 
-use outcome::Outcome;
+use outcome::{FAULT, Outcome};
 use parsers::{above_zero, finite_above_zero, finite_from_zero, name, remark};
 use regrind::document::{countable, visible};
 use regrind::drive::Request;
@@ -95,16 +90,8 @@ enum Command {
     Runs(runs::Arguments),
     Serve(serve::Arguments),
     Users(users::Arguments),
-    #[cfg(feature = "plant")]
-    Ship(replicate::Arguments),
-    #[cfg(feature = "plant")]
-    Work(run_queue::Arguments),
-    #[cfg(feature = "plant")]
-    Study(plant::studies::Arguments),
-    #[cfg(feature = "plant")]
-    Tell(publish::Arguments),
-    #[cfg(feature = "plant")]
-    Plant(plant::Arguments),
+    #[command(flatten)]
+    Plant(plant::Commands),
     Audit(audit::Arguments),
     Report(report::Arguments),
     Register(register::Arguments),
@@ -127,7 +114,7 @@ pub fn main() -> ExitCode {
             "error: a fault of the program itself: {panic}; please report this fault with the input files of the command"
         );
     }));
-    std::panic::catch_unwind(run).unwrap_or(ExitCode::from(failure::FAULT))
+    std::panic::catch_unwind(run).unwrap_or(ExitCode::from(FAULT))
 }
 
 fn run() -> ExitCode {
@@ -136,7 +123,7 @@ fn run() -> ExitCode {
         Err(error) => {
             // If the terminal itself fails, the error cannot be reported.
             let _ = error.print();
-            return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(failure::FAULT));
+            return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(FAULT));
         }
     };
     let ended = match arguments.command {
@@ -155,16 +142,7 @@ fn run() -> ExitCode {
         Command::Runs(arguments) => runs::run(&arguments),
         Command::Serve(arguments) => serve::run(&arguments),
         Command::Users(arguments) => users::run(&arguments),
-        #[cfg(feature = "plant")]
-        Command::Ship(arguments) => replicate::run(&arguments),
-        #[cfg(feature = "plant")]
-        Command::Work(arguments) => run_queue::run(&arguments),
-        #[cfg(feature = "plant")]
-        Command::Study(arguments) => plant::studies::run(&arguments),
-        #[cfg(feature = "plant")]
-        Command::Tell(arguments) => publish::run(&arguments),
-        #[cfg(feature = "plant")]
-        Command::Plant(arguments) => plant::run(&arguments),
+        Command::Plant(command) => plant::run(&command),
         Command::Audit(arguments) => audit::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Register(arguments) => register::run(&arguments),

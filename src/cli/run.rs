@@ -19,7 +19,7 @@ use regrind::setup;
 use super::failure::Failure;
 use super::live::{PreparedRun, RunContext, outcome};
 use super::succession::RunPlace;
-use super::{Outcome, check, key, outside, plan, serve, simulated};
+use super::{Outcome, check, key, outside, plan, plant, serve, simulated};
 
 /// Name of the file in the run folder with the knowledge of an earlier run from which the run began.
 pub(super) const LEARNED_FROM: &str = "learned_from.json";
@@ -66,18 +66,8 @@ pub(super) struct Arguments {
     /// Also show the cell as a page in the browser at this address, as `regrind serve` does
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = serve::ADDRESS)]
     pub(super) serve: Option<SocketAddr>,
-    /// Also replicate the record to the plant of this file, as `regrind ship` does
-    #[cfg(feature = "plant")]
-    #[arg(long, value_name = "FILE")]
-    pub(super) plant: Option<PathBuf>,
-    /// Part from the queue of the plant that this run makes
-    #[cfg(feature = "plant")]
-    #[arg(skip)]
-    pub(super) work: Option<Box<super::plant::ConfirmedPart>>,
-    /// File for the true state of the simulated part at the end
-    #[cfg(feature = "plant")]
-    #[arg(long, hide = true)]
-    pub(super) truth: Option<PathBuf>,
+    #[command(flatten)]
+    pub(super) plant: plant::RunArguments,
     /// Print a line of JSON for each event
     #[arg(long)]
     pub(super) json: bool,
@@ -124,9 +114,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             None => None,
         };
         let ending = carry_out(arguments, &recipe, &cell, task, plan, earlier, key).await?;
-        #[cfg(feature = "plant")]
-        if let (Some(world), Some(path)) = (&world, &arguments.truth) {
-            world.tell_truth(&recipe, &cell, path)?;
+        if let Some(served) = &world {
+            arguments.plant.write_truth(&served.world, &recipe, &cell)?;
         }
         drop(world);
         outcome(&ending)
@@ -158,22 +147,14 @@ async fn carry_out(
     }
     let page = arguments.serve.map(|at| serve::PageProcess::start(&arguments.runs, at, arguments.json));
     let _page = page.transpose()?;
-    #[cfg(feature = "plant")]
-    let _plant = arguments
-        .plant
-        .as_ref()
-        .map(|plant| super::plant::PlantProcesses::start(&arguments.runs, plant))
-        .transpose()?;
+    let _plant = arguments.plant.start_processes(&arguments.runs)?;
     let live = RunContext { recipe, cell, part: &part, folder: &folder, job, actor, json: arguments.json };
     let machines = live.open(job)?;
     if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {
         super::print(&earlier.in_words(&arguments.runs))?;
     }
     // The machines are locked, and nothing was sent to them. From here on the part belongs to this run.
-    #[cfg(feature = "plant")]
-    if let Some(work) = &arguments.work {
-        work.begin(&folder).await?;
-    }
+    arguments.plant.begin_part(&folder).await?;
     if key.is_none() && !arguments.json {
         super::print(
             "not signed: the origin of this record cannot be proven; create a signing key with `regrind audit key`\n",
@@ -218,40 +199,32 @@ impl EarlierKnowledge {
     /// # Errors
     /// The correction from the earlier run exceeds the limits of this task, or the plant file is invalid.
     fn apply_newest(task: &mut Task, arguments: &Arguments) -> Result<Self, Failure> {
-        let earlier = Self::newest(&arguments.runs, &task.setting, task.simulation);
+        let mut earlier = Self::newest(&arguments.runs, &task.setting, task.simulation);
         if let Some((learned, _)) = &earlier.learned {
             let run = learned.run.clone();
             task.start_from_learned(learned.clone()).map_err(|source| Failure::TooMuchLearned { run, source })?;
-        }
-        #[cfg(feature = "plant")]
-        if let (None, Some(plant)) = (&earlier.learned, &arguments.plant) {
-            return earlier.or_apply_plant(task, plant);
+        } else if let Some(learned) = arguments.plant.query_knowledge(task, &mut earlier.messages)? {
+            earlier.apply_plant(task, learned)?;
         }
         Ok(earlier)
     }
 
-    /// Changes `task` so that the run begins with the results that other cells of the plant have learned. `plant` is
-    /// the path of the plant file. Returns `self` with these results, and with messages for the operator. If the
-    /// results are not usable or the plant does not answer, `task` is unchanged and a message states the reason.
-    /// Returns an error if the plant file is invalid.
-    #[cfg(feature = "plant")]
-    fn or_apply_plant(mut self, task: &mut Task, plant: &Path) -> Result<Self, Failure> {
-        let told = super::plant::knowledge::query_knowledge(plant, task)?;
-        self.messages = told.description;
-        if let Some(learned) = told.learned {
-            // Read back in the same way as by a program that resumes the run.
-            let text = serde_json::to_vec(&learned).map_err(|error| Failure::Terminal(error.into()))?;
-            match task.start_from_learned(learned.clone()) {
-                Ok(()) => self.learned = Some((learned, text)),
-                Err(source) => {
-                    self.messages.push(format!(
-                        "the learned results of {} cannot be used, so the run begins without these results: {source}",
-                        learned.run
-                    ));
-                }
+    /// Changes `task` so that the run begins with `learned`, the results that other cells of the plant have learned. If
+    /// these results are not usable, `task` is unchanged and a message states the reason. Returns an error if the
+    /// results cannot be written as JSON.
+    fn apply_plant(&mut self, task: &mut Task, learned: Learned) -> Result<(), Failure> {
+        // Read back in the same way as by a program that resumes the run.
+        let text = serde_json::to_vec(&learned).map_err(|error| Failure::Terminal(error.into()))?;
+        match task.start_from_learned(learned.clone()) {
+            Ok(()) => self.learned = Some((learned, text)),
+            Err(source) => {
+                self.messages.push(format!(
+                    "the learned results of {} cannot be used, so the run begins without these results: {source}",
+                    learned.run
+                ));
             }
         }
-        Ok(self)
+        Ok(())
     }
 
     fn newest(runs: &Path, setting: &str, simulated: bool) -> Self {

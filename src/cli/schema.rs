@@ -1,10 +1,13 @@
 //! `regrind schema`: the JSON schemas of recipes, cell files and dialects, for editors.
 
-use clap::{Args, ValueEnum};
+use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use regrind::{config, recipe};
+use serde_json::Value;
 
 use super::Outcome;
 use super::failure::Failure;
+use super::plant;
 
 /// Print the JSON schema of recipes, cell files or dialects, for completion in an editor
 #[derive(Args, Debug)]
@@ -15,30 +18,29 @@ Example:
 Exit codes: 0 printed; 2 bad arguments; 3 fault.")]
 pub(super) struct Arguments {
     /// Kind of file
-    #[arg(value_enum)]
-    of: Kind,
+    #[arg(value_parser = of_kind())]
+    of: FileKind,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum Kind {
-    /// Recipes
-    Recipe,
-    /// Cell files
-    Cell,
-    /// Dialects of programs
-    Dialect,
-    /// Plant files
-    #[cfg(feature = "plant")]
-    Plant,
-}
+/// Kind of file: its name on the command line, its description, and its JSON schema.
+type FileKind = (&'static str, &'static str, fn() -> &'static Value);
+
+const KINDS: [FileKind; 3] = [
+    ("recipe", "Recipes", recipe::json_schema),
+    ("cell", "Cell files", config::json_schema),
+    ("dialect", "Dialects of programs", config::dialect_schema),
+];
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    super::print_json(match arguments.of {
-        Kind::Recipe => recipe::json_schema(),
-        Kind::Cell => config::json_schema(),
-        Kind::Dialect => config::dialect_schema(),
-        #[cfg(feature = "plant")]
-        Kind::Plant => config::plant_schema(),
-    })?;
+    let (_, _, schema) = arguments.of;
+    super::print_json(schema())?;
     Ok(Outcome::Accepted)
+}
+
+/// Returns the parser of an argument that names a kind of file.
+fn of_kind() -> impl TypedValueParser<Value = FileKind> {
+    let kinds = || KINDS.into_iter().chain(plant::FILE_KIND);
+    let words = kinds().map(|(name, help, _)| PossibleValue::new(name).help(help));
+    PossibleValuesParser::new(words)
+        .try_map(move |word| kinds().find(|(name, ..)| *name == word).ok_or("there is no such kind of file"))
 }

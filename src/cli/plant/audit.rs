@@ -1,21 +1,49 @@
 //! `regrind audit verify --plant`: verifies the plant's copy of a record, and compares it with the local journal.
 
-use std::path::Path;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
 
+use clap::Args;
 use regrind::formats::ScratchFolder;
 use regrind::journal::PublicKey;
 use regrind_plant::PlantRun;
 use serde_json::{Value, json};
 
+use super::super::Outcome;
 use super::super::control::folder_of;
 use super::super::failure::Failure;
 use super::plant_file::{open, read};
 
+/// Plant whose copy of a run is verified.
+#[derive(Args, Debug)]
+pub(in super::super) struct AuditArguments {
+    /// Also verify the copy at the plant of this file, and compare the journal with it; RUN may then be the name of a
+    /// run that is not on this computer
+    #[arg(long, value_name = "FILE", conflicts_with = "anchor")]
+    plant: Option<PathBuf>,
+}
+
+impl AuditArguments {
+    /// Verifies the copy of a run in the database of the plant, if a plant is given. The parameters and errors are those
+    /// of [`prove`]. Returns the result of the verification, or the outcome of the command if the run is not on this
+    /// computer, so that nothing is left to verify.
+    pub(in super::super) fn prove(
+        &self,
+        run: Option<&Path>,
+        keys: &[PublicKey],
+        json: bool,
+    ) -> Result<ControlFlow<Outcome, Option<Value>>, Failure> {
+        let Some(plant) = &self.plant else { return Ok(ControlFlow::Continue(None)) };
+        let Copy { is_here, content } = prove(plant, run, keys, json)?;
+        Ok(if is_here { ControlFlow::Continue(Some(content)) } else { ControlFlow::Break(Outcome::Accepted) })
+    }
+}
+
 /// Result of the verification of the plant's copy of a run.
-pub(in super::super) struct Copy {
+struct Copy {
     /// True if the run is also stored on this computer.
-    pub(in super::super) is_here: bool,
-    pub(in super::super) content: Value,
+    is_here: bool,
+    content: Value,
 }
 
 /// Fetches the copy of a run from the database of the plant, and verifies this copy. `keys` are the public keys for the
@@ -33,12 +61,7 @@ pub(in super::super) struct Copy {
 /// # Errors
 /// The plant cannot be reached or does not have the run, the copy is not valid, or the local journal differs from the
 /// copy.
-pub(in super::super) fn prove(
-    plant: &Path,
-    run: Option<&Path>,
-    keys: &[PublicKey],
-    json: bool,
-) -> Result<Copy, Failure> {
+fn prove(plant: &Path, run: Option<&Path>, keys: &[PublicKey], json: bool) -> Result<Copy, Failure> {
     let config = read(plant)?;
     let folder = match run {
         Some(run) if !run.is_dir() => None,

@@ -10,9 +10,9 @@ use super::plant_file::open;
 
 /// Confirmed part, before its run begins.
 #[derive(Clone, Debug)]
-pub(in super::super) struct ConfirmedPart {
-    pub(in super::super) config: PlantConfig,
-    pub(in super::super) lease: Lease,
+pub(super) struct ConfirmedPart {
+    pub(super) config: PlantConfig,
+    pub(super) lease: Lease,
 }
 
 impl ConfirmedPart {
@@ -20,7 +20,7 @@ impl ConfirmedPart {
     /// Returns after the plant has confirmed this assignment. The run must not begin earlier. If the answer of the
     /// plant is lost, repeats the request once. Returns an error if the plant refuses the assignment or cannot be
     /// reached.
-    pub(in super::super) async fn begin(&self, run: &Path) -> Result<(), Failure> {
+    pub(super) async fn begin(&self, run: &Path) -> Result<(), Failure> {
         let name = run.file_name().unwrap_or_default().to_string_lossy();
         let link = open(&self.config).await?;
         match self.lease.begin(&link, &name).await {

@@ -14,26 +14,23 @@ use super::plant_file::{open, read};
 /// Timeout for the plant, after which a run begins without its knowledge.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Result of a query of the plant for learned results.
-#[derive(Default)]
-pub(in super::super) struct PlantKnowledge {
-    /// Learned result from which the task can start; `None` if the other cells have no usable result.
-    pub(in super::super) learned: Option<Learned>,
-    /// Messages for the operator about results that cannot be used.
-    pub(in super::super) description: Vec<String>,
-}
-
 /// Queries the database of the plant for the results that other cells have learned about parts of the same kind.
-/// Combines these results into an initial state for the run of `task`. `plant` is the path of the plant file. If the
-/// plant does not answer within [`PATIENCE`], or answers with an error, the result contains only a message for the
-/// operator. The result is empty if the plant file names no database.
+/// Combines these results into an initial state for the run of `task`. `plant` is the path of the plant file. Adds a
+/// message for the operator to `messages` for each result that cannot be used.
+///
+/// Returns `None` if the other cells have no usable result, or if the plant file names no database. Also returns `None`,
+/// and adds a message with the reason, if the plant does not answer within [`PATIENCE`] or answers with an error.
 ///
 /// Returns an error only if the plant file is invalid.
-pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<PlantKnowledge, Failure> {
+pub(super) fn query_knowledge(
+    plant: &Path,
+    task: &Task,
+    messages: &mut Vec<String>,
+) -> Result<Option<Learned>, Failure> {
     let config = read(plant)?;
     // A plant file for live values only has no database to query.
     if config.database.is_none() {
-        return Ok(PlantKnowledge::default());
+        return Ok(None);
     }
     let (to, answer) = std::sync::mpsc::channel();
     let (kind, simulation) = (task.kind.clone(), task.simulation);
@@ -52,13 +49,17 @@ pub(in super::super) fn query_knowledge(plant: &Path, task: &Task) -> Result<Pla
         // The run can have begun without the answer.
         let _ = to.send(asked.map_err(|error| error.to_string()));
     });
-    let (knowledge, alike) = match answer.recv_timeout(PATIENCE) {
-        Ok(Ok(told)) => told,
-        Ok(Err(error)) => return Ok(without(&error)),
-        Err(_) => return Ok(without(&format!("no answer within {} s", PATIENCE.as_secs()))),
-    };
-    let words = knowledge.skipped;
-    Ok(PlantKnowledge { learned: task.learned_from_others(&knowledge.results, &alike), description: words })
+    let late = |_| Err(format!("no answer within {} s", PATIENCE.as_secs()));
+    match answer.recv_timeout(PATIENCE).unwrap_or_else(late) {
+        Ok((knowledge, alike)) => {
+            messages.extend(knowledge.skipped);
+            Ok(task.learned_from_others(&knowledge.results, &alike))
+        }
+        Err(reason) => {
+            messages.push(format!("the plant sends no learned results of other cells: {reason}"));
+            Ok(None)
+        }
+    }
 }
 
 /// Estimates how similar the machines of the cells are. The measure is the share of the repeatable error that only one
@@ -76,11 +77,4 @@ fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> MachineSimilari
         alike.compare([&one.known, &other.known], *is_own);
     }
     alike
-}
-
-fn without(reason: &str) -> PlantKnowledge {
-    PlantKnowledge {
-        learned: None,
-        description: vec![format!("the plant sends no learned results of other cells: {reason}")],
-    }
 }

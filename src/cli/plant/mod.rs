@@ -1,111 +1,69 @@
-//! `regrind plant`: the database of many cells, its members and its content.
+//! Commands and arguments of a plant of many cells: its database, and the live values of a cell. The program has them
+//! only with the feature `plant`; `absent.rs` is the twin of this module without it.
 
-pub(super) mod audit;
+mod audit;
+mod cell_monitor;
 mod confirmed_part;
-pub(super) mod knowledge;
+mod failure;
+mod knowledge;
+mod manage;
 mod members;
 mod plant_file;
+mod processes;
+mod publish;
 mod queue;
 mod recipes;
+mod replicate;
+mod run_arguments;
+mod run_queue;
 mod runs;
 mod serve;
-pub(super) mod studies;
+mod studies;
+mod truth;
 
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use clap::Subcommand;
+use regrind_live::LiveError;
+use regrind_plant::PlantError;
+use serde_json::Value;
 
 use super::Outcome;
 use super::failure::Failure;
-use clap::{Args, Subcommand};
-pub(super) use confirmed_part::ConfirmedPart;
-use plant_file::Where;
-pub(super) use plant_file::{open, read};
-pub(super) use recipes::is_below;
+pub(super) use audit::AuditArguments;
+pub(super) use failure::PlantFailure;
+pub(super) use run_arguments::RunArguments;
 
-/// Manage the database of a plant of many cells
-#[derive(Args, Debug)]
-#[command(after_help = "\
-A cell makes parts also without a plant. The plant never commands a motion. The database is PostgreSQL 15 or later;
-a plant file (config/plant/plant.toml) gives its address and user. docs/plant.md shows the steps from one cell to four.
-
-Examples:
-  regrind plant init --plant owner.toml
-  regrind plant enrol cell-1 --plant owner.toml --password-file cell-1.password --key cell-1.key
-  regrind plant cells --plant planner.toml
-
-Exit codes: 0 done; 1 a check failed, or something does not exist; 2 bad arguments, or the
-database refuses the command; 3 the database cannot be reached.")]
-pub(super) struct Arguments {
-    #[command(subcommand)]
-    what: PlantCommand,
-}
-
+/// Commands of a plant.
 #[derive(Debug, Subcommand)]
-enum PlantCommand {
-    Init(members::ToInit),
-    Enrol(members::ToEnrol),
-    Retire(members::ToRetire),
-    Cells(members::ToList),
-    Runs(runs::ToList),
-    Fetch(runs::ToFetch),
-    Incidents(runs::ToListIncidents),
-    Propose(recipes::ToPropose),
-    Approve(recipes::ToApprove),
-    Withdraw(recipes::ToWithdraw),
-    Recipes(recipes::ToList),
-    Queue(queue::ToQueue),
-    Unqueue(queue::ToUnqueue),
-    Work(queue::ToList),
-    Serve(serve::Arguments),
+pub(super) enum Commands {
+    Ship(replicate::Arguments),
+    Work(run_queue::Arguments),
+    Study(studies::Arguments),
+    Tell(publish::Arguments),
+    Plant(manage::Arguments),
 }
 
-pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    match &arguments.what {
-        PlantCommand::Init(of) => members::init(of),
-        PlantCommand::Enrol(of) => members::enrol(of),
-        PlantCommand::Retire(of) => members::retire(of),
-        PlantCommand::Cells(of) => members::list(of),
-        PlantCommand::Runs(of) => runs::list(of),
-        PlantCommand::Fetch(of) => runs::fetch(of),
-        PlantCommand::Incidents(of) => runs::incidents(of),
-        PlantCommand::Propose(of) => recipes::propose(of),
-        PlantCommand::Approve(of) => recipes::approve(of),
-        PlantCommand::Withdraw(of) => recipes::withdraw(of),
-        PlantCommand::Recipes(of) => recipes::list(of),
-        PlantCommand::Queue(of) => queue::queue(of),
-        PlantCommand::Unqueue(of) => queue::unqueue(of),
-        PlantCommand::Work(of) => queue::list(of),
-        PlantCommand::Serve(of) => serve::serve(of),
+pub(super) fn run(command: &Commands) -> Result<Outcome, Failure> {
+    match command {
+        Commands::Ship(arguments) => replicate::run(arguments),
+        Commands::Work(arguments) => run_queue::run(arguments),
+        Commands::Study(arguments) => studies::run(arguments),
+        Commands::Tell(arguments) => publish::run(arguments),
+        Commands::Plant(arguments) => manage::run(arguments),
     }
 }
 
-/// Programs that replicate and publish a run for the plant while it is active. They are separate processes, so they can
-/// neither slow the run down nor stop it. They end shortly after the program that holds this value, because then their
-/// standard input ends.
-pub(super) struct PlantProcesses {
-    _programs: Vec<Child>,
+/// Kind of file of a plant: its name on the command line, its description, and its JSON schema.
+pub(super) const FILE_KIND: Option<(&str, &str, fn() -> &'static Value)> =
+    Some(("plant", "Plant files", regrind::config::plant_schema));
+
+impl From<PlantError> for Failure {
+    fn from(error: PlantError) -> Self {
+        Self::Plant(error.into())
+    }
 }
 
-impl PlantProcesses {
-    /// Starts the helper programs for the runs in the folder `runs`, each in a separate process. `plant` is the path of
-    /// the plant file.
-    ///
-    /// - If the plant file has a table `[database]`, the program `ship` replicates the records to the plant.
-    /// - If the plant file has a table `[sparkplug]` or `[opcua]`, the program `tell` publishes live values.
-    ///
-    /// The helper programs end shortly after the returned value is dropped. Returns an error if the plant file is
-    /// invalid or a process cannot be started.
-    pub(super) fn start(runs: &Path, plant: &Path) -> Result<Self, Failure> {
-        // Errors of the file are reported here, before anything opens.
-        let config = read(plant)?;
-        let tells = config.sparkplug.is_some() || config.opcua.is_some();
-        let wanted = [("ship", config.database.is_some()), ("tell", tells)];
-        let begun = wanted.into_iter().filter(|(_, is_wanted)| *is_wanted).map(|(name, _)| {
-            let mut command = Command::new(std::env::current_exe()?);
-            command.args([name, "--while-stdin", "--plant"]).arg(plant).arg("--runs").arg(runs);
-            super::outside::set_apart(&mut command);
-            command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn()
-        });
-        Ok(Self { _programs: begun.collect::<Result<_, _>>().map_err(Failure::Terminal)? })
+impl From<LiveError> for Failure {
+    fn from(error: LiveError) -> Self {
+        Self::Plant(error.into())
     }
 }

@@ -24,7 +24,7 @@ impl Where {
 }
 
 /// Reads a plant file. If it is invalid, prints its problems and returns a failure.
-pub(in super::super) fn read(file: &Path) -> Result<PlantConfig, Failure> {
+pub(super) fn read(file: &Path) -> Result<PlantConfig, Failure> {
     check::or_show(PlantConfig::read(file))
 }
 
@@ -49,7 +49,7 @@ pub(super) async fn open_any(config: &PlantConfig) -> Result<DatabaseLink, Failu
 
 /// Signs in to the database that the plant file names, and checks the table layout (version of the tables) in this
 /// database. Returns an error if the sign-in fails, or if this program does not support the layout.
-pub(in super::super) async fn open(config: &PlantConfig) -> Result<DatabaseLink, Failure> {
+pub(super) async fn open(config: &PlantConfig) -> Result<DatabaseLink, Failure> {
     let link = open_any(config).await?;
     regrind_plant::check_layout(link.client()).await?;
     Ok(link)

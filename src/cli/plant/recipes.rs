@@ -11,6 +11,7 @@ use serde_json::json;
 
 use super::super::failure::Failure;
 use super::super::{Outcome, check, name};
+use super::failure::PlantFailure;
 use super::plant_file::{Where, open};
 
 /// Propose a recipe to the plant, as the next version under its name
@@ -145,7 +146,8 @@ pub(super) fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Fai
             );
             return Err(PlantError::Recipe(what).into());
         };
-        let content = std::fs::read(path).map_err(|source| Failure::Unreadable { path: path.to_owned(), source })?;
+        let content =
+            std::fs::read(path).map_err(|source| PlantFailure::Unreadable { path: path.to_owned(), source })?;
         files.insert(inside.replace('\\', "/"), content);
     }
     Ok(files)
@@ -153,7 +155,7 @@ pub(super) fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Fai
 
 /// Returns true if `path` is a relative path that stays below its start folder, so that no part of the path is `..`.
 /// Returns false for an empty or absolute path.
-pub(in super::super) fn is_below(path: &Path) -> bool {
+pub(super) fn is_below(path: &Path) -> bool {
     path.components().next().is_some() && path.components().all(|part| matches!(part, Component::Normal(_)))
 }
 

@@ -38,7 +38,7 @@ Examples:
 
 Exit codes: 0 done; 1 there is no such study; 2 bad arguments, or the database refuses the command; 3 the database
 cannot be reached.")]
-pub(in super::super) struct Arguments {
+pub(super) struct Arguments {
     #[command(subcommand)]
     what: StudyCommand,
 }
@@ -133,7 +133,7 @@ struct ToStop {
     plant: Where,
 }
 
-pub(in super::super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     match &arguments.what {
         StudyCommand::Begin(of) => begin(of),
         StudyCommand::Work(of) => work(of),

@@ -10,9 +10,11 @@ use regrind_live::{CellStatus, RunStatus};
 use regrind_plant::{DatabaseLink, PlantError, ReplicationResult, Replicator};
 use serde_json::json;
 
+use super::super::failure::Failure;
+use super::super::{Outcome, outside};
 use super::cell_monitor::CellMonitor;
-use super::failure::Failure;
-use super::{Outcome, outside, plant};
+use super::failure::PlantFailure;
+use super::plant_file::{open, read};
 
 /// Time between two rounds, and maximum wait for an unreachable plant.
 const ROUND: Duration = Duration::from_secs(1);
@@ -52,7 +54,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let config = plant::read(&arguments.plant)?;
+    let config = read(&arguments.plant)?;
     // Other programs of this computer have priority.
     outside::give_way();
     let mut shipping = Replication {
@@ -63,7 +65,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         monitor: None,
         waits: false,
     };
-    super::runtime()?.block_on(async {
+    super::super::runtime()?.block_on(async {
         if arguments.once {
             return shipping.once().await;
         }
@@ -142,7 +144,7 @@ impl Replication<'_> {
     /// closes the connection and returns the error.
     async fn round(&mut self) -> Result<ReplicationResult, Failure> {
         if self.link.as_ref().is_none_or(DatabaseLink::is_closed) {
-            self.link = Some(plant::open(&self.config).await?);
+            self.link = Some(open(&self.config).await?);
         }
         let Some(link) = &self.link else { return Ok(ReplicationResult::default()) };
         let shipped = self.shipper.round(link).await;
@@ -180,17 +182,17 @@ impl Replication<'_> {
         }
         let ReplicationResult { records, files, runs, .. } = shipped;
         if self.arguments.json {
-            return super::print(&format!("{}\n", json!({ "records": records, "files": files, "runs": runs })));
+            return super::super::print(&format!("{}\n", json!({ "records": records, "files": files, "runs": runs })));
         }
         if self.arguments.while_stdin {
             return Ok(());
         }
-        super::print(&format!("shipped {records} records and {files} files of {runs} runs\n"))
+        super::super::print(&format!("shipped {records} records and {files} files of {runs} runs\n"))
     }
 
     /// Prints `error`, which states why the plant cannot be reached. Prints nothing if such an error was printed since
     /// the last successful round.
-    fn waits_for(&mut self, error: &PlantError) -> Result<(), Failure> {
+    fn waits_for(&mut self, error: &PlantFailure) -> Result<(), Failure> {
         if !std::mem::replace(&mut self.waits, true) {
             eprintln!(
                 "ship: {error}; the cell continues, and its records stay on this computer until the plant can be reached"

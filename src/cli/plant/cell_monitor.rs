@@ -9,13 +9,13 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
-use regrind::drive::Request;
+use regrind::drive::{Request, is_live};
 use regrind::journal::{DATABASE, Reader, Stamp, is_driven, stamp};
 use regrind::record::{Begin, RunContent};
 use regrind::report::{RunResult, RunSummary, run_summary};
 use regrind_live::{CellStatus, EndedRun, RunStatus};
 
-use super::control;
+use super::super::control;
 
 /// Time for which a run may give no answer, for example while it starts or ends. After this time its status is
 /// `Unresponsive`.
@@ -52,7 +52,7 @@ impl CellMonitor {
     /// Keeps the last known status if the records cannot be read at the moment, or if the run does not answer. If the
     /// run has not answered for more than 5 s, the status becomes `Unresponsive`.
     pub(super) fn poll(&mut self) -> &CellStatus {
-        let live = control::live_runs(&self.runs).next();
+        let live = live_runs(&self.runs).next();
         match live {
             Some(run) => match regrind_control::send_request(&run, &Request::Status) {
                 Ok(reply) => {
@@ -164,6 +164,12 @@ impl CellMonitor {
         self.known.insert(run.to_owned(), (at, last));
         last
     }
+}
+
+/// Returns the folders of the active runs in the folder `runs`. A run is active if a cell listens for orders at the
+/// control socket in the run folder.
+pub(super) fn live_runs(runs: &Path) -> impl Iterator<Item = PathBuf> {
+    control::folders(runs).filter(|folder| is_live(folder))
 }
 
 /// Returns the name of a run: the name of its folder.

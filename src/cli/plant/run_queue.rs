@@ -12,9 +12,13 @@ use regrind::journal::{DATABASE, Reader, RecordKind};
 use regrind::recipe::Recipe;
 use regrind_plant::{DatabaseLink, LEASE, Lease, PlantError, PlantRecipe, StartedPart};
 
-use super::failure::Failure;
-use super::plant::ConfirmedPart;
-use super::{Outcome, check, plant, run as making, terminal};
+use super::super::failure::Failure;
+use super::super::{Outcome, check, run as making, terminal};
+use super::confirmed_part::ConfirmedPart;
+use super::failure::PlantFailure;
+use super::plant_file::{open, read};
+use super::recipes::is_below;
+use super::run_arguments::RunArguments;
 
 /// Time between two queries of the queue with `--wait`.
 const ROUND: Duration = Duration::from_secs(5);
@@ -47,13 +51,13 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "FILE", default_value = BUILT_IN_CELL)]
     cell: PathBuf,
     /// Name of the person at the cell
-    #[arg(long, value_name = "NAME", value_parser = super::name)]
+    #[arg(long, value_name = "NAME", value_parser = super::super::name)]
     operator: Option<String>,
     /// Folder in which to create the folders of the runs
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
     /// Confirm the part with this serial number, if it is the next; give back any other part
-    #[arg(long, value_name = "SERIAL", value_parser = super::name)]
+    #[arg(long, value_name = "SERIAL", value_parser = super::super::name)]
     part: Option<String>,
     /// Make at most one part
     #[arg(long)]
@@ -62,13 +66,13 @@ pub(super) struct Arguments {
     #[arg(long, conflicts_with = "once")]
     wait: bool,
     /// Give back a part that was started here without any result of its run: you have checked that nothing was ground
-    #[arg(long, value_name = "SERIAL", value_parser = super::name, conflicts_with_all = ["part", "once", "wait"])]
+    #[arg(long, value_name = "SERIAL", value_parser = super::super::name, conflicts_with_all = ["part", "once", "wait"])]
     give_back: Option<String>,
     /// Give up a part whose run was interrupted and will not be resumed: a planner decides whether it is made again
-    #[arg(long, value_name = "SERIAL", value_parser = super::name, requires = "reason", conflicts_with_all = ["part", "once", "wait", "give_back"])]
+    #[arg(long, value_name = "SERIAL", value_parser = super::super::name, requires = "reason", conflicts_with_all = ["part", "once", "wait", "give_back"])]
     give_up: Option<String>,
     /// Reason for giving it up, for the record
-    #[arg(long, alias = "why", value_name = "WORDS", value_parser = super::name, requires = "give_up")]
+    #[arg(long, alias = "why", value_name = "WORDS", value_parser = super::super::name, requires = "give_up")]
     reason: Option<String>,
     /// Seed of other simulated parts and runs
     #[arg(long, value_name = "N")]
@@ -79,19 +83,19 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let config = plant::read(&arguments.plant)?;
+    let config = read(&arguments.plant)?;
     if let Some(serial) = arguments.give_back.as_ref().or(arguments.give_up.as_ref()) {
-        return super::runtime()?.block_on(give(&config, &arguments.runs, serial, arguments.reason.as_deref()));
+        return super::super::runtime()?.block_on(give(&config, &arguments.runs, serial, arguments.reason.as_deref()));
     }
     loop {
-        let (recipe, taken) = match super::runtime()?.block_on(next(&config, arguments))? {
+        let (recipe, taken) = match super::super::runtime()?.block_on(next(&config, arguments))? {
             Next::Part(recipe, taken) => (recipe, taken),
             Next::None if arguments.wait => {
                 std::thread::sleep(ROUND);
                 continue;
             }
             Next::None => {
-                super::print("no part is waiting for this cell\n")?;
+                super::super::print("no part is waiting for this cell\n")?;
                 return Ok(Outcome::Accepted);
             }
             Next::GivenBack => return Ok(Outcome::NotInTolerance),
@@ -106,9 +110,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             loaded: false,
             seed: arguments.seed,
             serve: None,
-            plant: Some(arguments.plant.clone()),
-            work: Some(taken),
-            truth: None,
+            plant: RunArguments { plant: Some(arguments.plant.clone()), work: Some(taken), truth: None },
             json: arguments.json,
         })?;
         // After any other result a person must act before the next blank is ground.
@@ -135,7 +137,7 @@ enum Next {
 /// If the recipe is invalid or not approved, returns the part to the queue and returns an error. Also returns an error
 /// if a part that this cell has started still has an open run.
 async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failure> {
-    let link = plant::open(config).await?;
+    let link = open(config).await?;
     nothing_is_open(&link, &arguments.runs).await?;
     let Some(lease) = Lease::acquire(&link).await? else { return Ok(Next::None) };
     let (recipe, signed) = match PlantRecipe::pull(&link, &lease.recipe_sha256, &config.approvers).await {
@@ -161,12 +163,12 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
         lease.serial,
         signed.join(" and ")
     );
-    super::print(&regrind::document::visible(&told))?;
+    super::super::print(&regrind::document::visible(&told))?;
     match confirmed(&link, &lease, &read, arguments).await? {
         true => Ok(Next::Part(path, Box::new(ConfirmedPart { config: config.clone(), lease }))),
         false => {
             lease.hand_back(&link, "no person at the cell confirmed the part").await?;
-            super::print("the part is given back\n")?;
+            super::super::print("the part is given back\n")?;
             Ok(Next::GivenBack)
         }
     }
@@ -189,7 +191,7 @@ async fn confirmed(
     if !recipe.cycle.confirm_work {
         return Ok(true);
     }
-    super::print(
+    super::super::print(
         "  type or scan the serial number to start this part; any other input returns the part to the queue: ",
     )?;
     let mut answer = tokio::task::spawn_blocking(terminal::answer);
@@ -218,7 +220,7 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
                     "run {run} of {serial} is not over: regrind resume {} continues the run; if resume is refused, give up the part: regrind work --give-up {serial} --reason \"...\"",
                     folder.display()
                 );
-                return Err(Failure::OpenWork { reason });
+                return Err(PlantFailure::OpenWork { reason }.into());
             }
             RunProgress::Nowhere => {
                 format!(
@@ -229,7 +231,7 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
             RunProgress::Begun => "which sent no request to a machine; return the part to the queue".to_owned(),
         };
         let reason = format!("{serial} was begun in run {run}, {nothing}: regrind work --give-back {serial}");
-        return Err(Failure::OpenWork { reason });
+        return Err(PlantFailure::OpenWork { reason }.into());
     }
     Ok(())
 }
@@ -241,20 +243,20 @@ async fn nothing_is_open(link: &DatabaseLink, runs: &Path) -> Result<(), Failure
 /// # Errors
 /// The run of the part is active. Without a reason, also: the run has sent a command to a machine or has ended.
 async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>) -> Result<Outcome, Failure> {
-    let link = plant::open(config).await?;
+    let link = open(config).await?;
     let begun = StartedPart::all(&link).await?.into_iter().find(|begun| begun.lease.serial == serial);
     let Some(begun) = begun else {
-        super::print(&format!("{serial} was not started by this cell\n"))?;
+        super::super::print(&format!("{serial} was not started by this cell\n"))?;
         return Ok(Outcome::NotInTolerance);
     };
     let (run, folder) = (&begun.run, runs.join(&begun.run));
-    let refused = |reason: String| Err(Failure::OpenWork { reason });
+    let refused = |reason: String| Err(PlantFailure::OpenWork { reason }.into());
     if is_live(&folder) {
         return refused(format!("run {run} of {serial} is active; end the run first with regrind stop"));
     }
     if let Some(reason) = up {
         begun.give_up(&link, reason).await?;
-        super::print(&format!(
+        super::super::print(&format!(
             "the part {serial} is given up; to make the part again, a planner must queue the part again\n"
         ))?;
         return Ok(Outcome::Accepted);
@@ -265,7 +267,7 @@ async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>)
         ));
     }
     begun.give_back(&link, "its run did nothing").await?;
-    super::print(&format!("the part {serial} is returned to the queue\n"))?;
+    super::super::print(&format!("the part {serial} is returned to the queue\n"))?;
     Ok(Outcome::Accepted)
 }
 
@@ -312,7 +314,7 @@ fn keep(runs: &Path, sha256: &str, recipe: &PlantRecipe) -> Result<PathBuf, Fail
     write(&path, recipe.text.as_bytes())?;
     for (name, content) in &recipe.files {
         let inside = Path::new(name);
-        if !plant::is_below(inside) {
+        if !is_below(inside) {
             let what = format!(
                 "the recipe {} names the file {name:?}, which is outside of the folder of the recipe; propose the recipe again with all files in its folder",
                 recipe.name

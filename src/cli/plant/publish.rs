@@ -14,9 +14,11 @@ use serde_json::json;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 
-use super::cell_monitor::{CellMonitor, name};
-use super::failure::Failure;
-use super::{Outcome, check, control, outside, plant, replicate};
+use super::super::failure::Failure;
+use super::super::{Outcome, check, outside};
+use super::cell_monitor::{CellMonitor, live_runs, name};
+use super::plant_file::read;
+use super::replicate;
 
 /// Time between two searches for a run, and between two tries for the publisher lock.
 const ROUND: Duration = Duration::from_secs(1);
@@ -56,11 +58,11 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let config = plant::read(&arguments.plant)?;
+    let config = read(&arguments.plant)?;
     let cell = cell_of(&config)?;
     // Other programs of this computer have priority.
     outside::give_way();
-    super::runtime()?.block_on(async {
+    super::super::runtime()?.block_on(async {
         let mut endings = outside::Endings::new().map_err(Failure::Signals)?;
         let ended = async {
             if arguments.while_stdin {
@@ -149,7 +151,7 @@ async fn publish(
     let _ = tokio::time::timeout(FAREWELL, &mut hearing).await;
     match over {
         Some(over) => {
-            over.map_err(|error| Failure::Terminal(error.into()))?.map(|()| Outcome::Accepted).map_err(Failure::Live)
+            over.map_err(|error| Failure::Terminal(error.into()))?.map(|()| Outcome::Accepted).map_err(Failure::from)
         }
         None => Ok(Outcome::Accepted),
     }
@@ -185,7 +187,7 @@ enum Never {}
 /// with the monitor `look`, every [`ROUND`]. Never returns.
 async fn follow(mut look: CellMonitor, runs: &Path, to: &watch::Sender<CellStatus>) -> Never {
     loop {
-        if let Some(folder) = control::live_runs(runs).next() {
+        if let Some(folder) = live_runs(runs).next() {
             watch_run(&folder, &mut look, to).await;
         }
         look = look.poll_in_background().await;
@@ -310,7 +312,7 @@ async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
     let by = OnBehalf { name: None, station: by.to_owned() };
     // A run that does not answer delays only this report.
     let recorded = tokio::task::spawn_blocking(move || {
-        let run = control::live_runs(&runs).next()?;
+        let run = live_runs(&runs).next()?;
         Some(regrind_control::send_request_on_behalf(&run, &remark, Some(by)).is_ok_and(|reply| reply.accepted))
     });
     if recorded.await.ok().flatten() == Some(false) {
@@ -322,7 +324,7 @@ fn say(json: bool, fields: &serde_json::Value, words: &str) {
     eprintln!("tell: {words}");
     if json {
         // A reader that is gone is not an error.
-        let _ = super::print(&format!("{fields}\n"));
+        let _ = super::super::print(&format!("{fields}\n"));
     }
 }
 
