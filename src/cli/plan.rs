@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use regrind::cell::FirstStep;
+use regrind::cell::{CellPlan, FirstStep};
 use regrind::compensation::path::{ArcSummary, PathSummary, Peak, Scallops, ToolPath};
 use regrind::config::{BUILT_IN_CELL, CellConfig};
 use regrind::drive::Task;
@@ -42,6 +42,26 @@ pub(super) struct Arguments {
 
 /// Duration of a shift in minutes. No pass and no measurement is meant to take longer.
 const MAX_MINUTES: f64 = 480.0;
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let recipe = or_show(Recipe::read(&arguments.recipe))?;
+    let cell = or_show(CellConfig::read(&arguments.cell))?;
+    let (task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
+    let program = first_path(&task, &recipe, &cell)?;
+    let arcs = arcs_of(&task, program.as_ref())?;
+    if let Some(file) = &arguments.program {
+        let first = task.first_correction();
+        let programs = task.programs.as_ref().map_err(|error| Failure::Programs(error.clone().into()))?;
+        programs.write(file, &first, task.map_identity(&first)).map_err(Failure::Programs)?;
+    }
+    let document = Document::new((&recipe, &cell), (&task, &plan), program.as_ref(), arcs);
+    if arguments.json {
+        super::print_json(&document)?;
+    } else {
+        super::print(&words(&document))?;
+    }
+    Ok(Outcome::Accepted)
+}
 
 #[derive(Serialize)]
 struct Document {
@@ -252,78 +272,71 @@ impl ScallopsDocument {
     }
 }
 
-pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let recipe = or_show(Recipe::read(&arguments.recipe))?;
-    let cell = or_show(CellConfig::read(&arguments.cell))?;
-    let (task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
-    let program = first_path(&task, &recipe, &cell)?;
-    let arcs = arcs_of(&task, program.as_ref())?;
-    if let Some(file) = &arguments.program {
-        let first = task.first_correction();
-        let programs = task.programs.as_ref().map_err(|error| Failure::Programs(error.clone().into()))?;
-        programs.write(file, &first, task.map_identity(&first)).map_err(Failure::Programs)?;
+impl Document {
+    /// Describes the plan `plan` of the run with the task `task`. `program` is the path of the first pass with its
+    /// summary, if there is one, and `arcs` describes its arcs.
+    fn new(
+        (recipe, cell): (&Recipe, &CellConfig),
+        (task, plan): (&Task, &CellPlan),
+        program: Option<&(ToolPath, PathSummary)>,
+        arcs: Option<ArcsDocument>,
+    ) -> Self {
+        let (tracks, pass_mm) = tracks_of_pass(task, program);
+        let path_mm = pass_mm * f64::from(1 + task.pass.spark_out_passes);
+        let depth_um = 1e3 * task.correction_limits.depth_of_cut_mm;
+        let passes = f64::from(plan.max_cycles.max(1) - 1);
+        let first_um = 1e3 * task.correction_limits.allowance_mm;
+        let grinding_minutes = path_mm / task.pass.feed_mm_min;
+        let removed_mm3_a_pass = pass_mm * task.pass.track_spacing_mm * task.correction_limits.depth_of_cut_mm;
+        let max_measurements = plan.max_cycles + u32::from(plan.begin_with == FirstStep::Measure);
+        let min_measuring_minutes = min_measuring_minutes(task);
+        let min_minutes = f64::from(plan.max_cycles) * grinding_minutes
+            + f64::from(max_measurements) * min_measuring_minutes.unwrap_or(0.0);
+        Self {
+            simulation: cell.simulated,
+            part: recipe.part.name.clone(),
+            part_identity: task.part_identity.iter().map(|b| format!("{b:02x}")).collect(),
+            nominal_points: task.nominal.len(),
+            targets: task.targets.len(),
+            touches_are_chosen: task.adaptive.is_some(),
+            sphere_points: task.reference_sphere.map_or(0, |s| s.points),
+            max_cycles: plan.max_cycles,
+            first_level_um: first_um,
+            depth_of_cut_um: depth_um,
+            last_level_um: first_um - (passes * depth_um).min(1e3 * task.correction_limits.removal_budget_mm),
+            removal_budget_um: 1e3 * task.correction_limits.removal_budget_mm,
+            tracks: tracks as u64,
+            track_mm: task.pass.track_spacing_mm,
+            scallops: task.scallops.map(|scallops| ScallopsDocument::new(&scallops, recipe)),
+            path_mm,
+            grinding_minutes,
+            removed_mm3_a_pass,
+            wheel_loss_mm3_a_pass: recipe.grinding.grinding_ratio.map(|ratio| removed_mm3_a_pass / ratio),
+            max_passes: plan.max_cycles,
+            max_measurements,
+            min_measuring_minutes,
+            min_hours_total: min_minutes / 60.0,
+            warnings: warnings(task, path_mm, grinding_minutes, min_measuring_minutes)
+                .into_iter()
+                .chain(warning_of_scallops(task, recipe))
+                .collect(),
+            program_points: program.map(|(_, summary)| summary.points),
+            arcs,
+            dialect: cell.grinder.program.dialect.dialect.name.clone(),
+            tilt: program.and_then(|(path, summary)| TiltDocument::new(path, summary)),
+            no_program: task.programs.as_ref().err().map(ToString::to_string),
+            learns: recipe.compensation.learn,
+        }
     }
-    let (tracks, pass_mm) = tracks_and_length_mm(&task, program.as_ref());
-    let path_mm = pass_mm * f64::from(1 + task.pass.spark_out_passes);
-    let depth_um = 1e3 * task.correction_limits.depth_of_cut_mm;
-    let passes = f64::from(plan.max_cycles.max(1) - 1);
-    let first_um = 1e3 * task.correction_limits.allowance_mm;
-    let grinding_minutes = path_mm / task.pass.feed_mm_min;
-    let removed_mm3_a_pass = pass_mm * task.pass.track_spacing_mm * task.correction_limits.depth_of_cut_mm;
-    let max_measurements = plan.max_cycles + u32::from(plan.begin_with == FirstStep::Measure);
-    let min_measuring_minutes = min_measuring_minutes(&task);
-    let min_minutes = f64::from(plan.max_cycles) * grinding_minutes
-        + f64::from(max_measurements) * min_measuring_minutes.unwrap_or(0.0);
-    let document = Document {
-        simulation: cell.simulated,
-        part: recipe.part.name.clone(),
-        part_identity: task.part_identity.iter().map(|b| format!("{b:02x}")).collect(),
-        nominal_points: task.nominal.len(),
-        targets: task.targets.len(),
-        touches_are_chosen: task.adaptive.is_some(),
-        sphere_points: task.reference_sphere.map_or(0, |s| s.points),
-        max_cycles: plan.max_cycles,
-        first_level_um: first_um,
-        depth_of_cut_um: depth_um,
-        last_level_um: first_um - (passes * depth_um).min(1e3 * task.correction_limits.removal_budget_mm),
-        removal_budget_um: 1e3 * task.correction_limits.removal_budget_mm,
-        tracks: tracks as u64,
-        track_mm: task.pass.track_spacing_mm,
-        scallops: task.scallops.map(|scallops| ScallopsDocument::new(&scallops, &recipe)),
-        path_mm,
-        grinding_minutes,
-        removed_mm3_a_pass,
-        wheel_loss_mm3_a_pass: recipe.grinding.grinding_ratio.map(|ratio| removed_mm3_a_pass / ratio),
-        max_passes: plan.max_cycles,
-        max_measurements,
-        min_measuring_minutes,
-        min_hours_total: min_minutes / 60.0,
-        warnings: warnings(&task, path_mm, grinding_minutes, min_measuring_minutes)
-            .into_iter()
-            .chain(warning_of_scallops(&task, &recipe))
-            .collect(),
-        program_points: program.as_ref().map(|(_, summary)| summary.points),
-        arcs,
-        dialect: cell.grinder.program.dialect.dialect.name.clone(),
-        tilt: program.as_ref().and_then(|(path, summary)| TiltDocument::new(path, summary)),
-        no_program: task.programs.as_ref().err().map(ToString::to_string),
-        learns: recipe.compensation.learn,
-    };
-    if arguments.json {
-        super::print_json(&document)?;
-    } else {
-        super::print(&words(&document))?;
-    }
-    Ok(Outcome::Accepted)
 }
 
-/// Returns the number of tracks of a pass and its length in mm. `program` is the path of the pass with its summary.
-/// Without a program, tracks over the box around the part are the best estimate.
-fn tracks_and_length_mm(task: &Task, program: Option<&(ToolPath, PathSummary)>) -> (f64, f64) {
-    let [width, depth] = [task.pass.x_mm, task.pass.y_mm].map(|[low, high]| high - low);
+/// Returns the number of tracks of a pass, and their length together in mm. `program` is the path of the first pass with
+/// its summary. Without a program, tracks over the box around the part are the best estimate.
+fn tracks_of_pass(task: &Task, program: Option<&(ToolPath, PathSummary)>) -> (f64, f64) {
     match program {
         Some((path, summary)) => (path.track_count() as f64, summary.length_mm),
         None => {
+            let [width, depth] = [task.pass.x_mm, task.pass.y_mm].map(|[low, high]| high - low);
             let tracks = (depth / task.pass.track_spacing_mm).floor() + 1.0;
             (tracks, tracks * width)
         }
