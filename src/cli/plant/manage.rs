@@ -19,7 +19,7 @@ Examples:
 
 Exit codes: 0 done; 1 a check failed, or something does not exist; 2 bad arguments, or the
 database refuses the command; 3 the database cannot be reached.")]
-pub(super) struct Arguments {
+pub(in crate::cli) struct Arguments {
     #[command(subcommand)]
     what: PlantCommand,
 }

@@ -42,7 +42,7 @@ Example:
   regrind tell --plant plant.toml --runs /srv/runs
 
 Exit codes: 0 stopped by Ctrl-C; 2 bad arguments, or an entry of the plant file cannot be used.")]
-pub(super) struct Arguments {
+pub(in crate::cli) struct Arguments {
     /// Plant file: receivers of the values
     #[arg(long, value_name = "FILE")]
     plant: PathBuf,

@@ -35,7 +35,7 @@ Examples:
 
 Exit codes: 0 stopped by Ctrl-C, or everything has arrived; 1 a run differs from its copy at the plant; 2 bad arguments;
 3 with --once, the plant cannot be reached.")]
-pub(super) struct Arguments {
+pub(in crate::cli) struct Arguments {
     /// Plant file: address and user of the database
     #[arg(long, value_name = "FILE")]
     plant: PathBuf,

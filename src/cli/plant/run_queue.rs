@@ -43,7 +43,7 @@ Examples:
 Exit codes: 0 all queued parts are accepted; 1 a part was not accepted, was returned to the queue, or was started
 here and is not finished;
 2 bad arguments, or a recipe that is not approved; 3 a fault or abort, or the plant cannot be reached.")]
-pub(super) struct Arguments {
+pub(in crate::cli) struct Arguments {
     /// Plant file: address and user of the database, and the approvers of recipes
     #[arg(long, value_name = "FILE")]
     plant: PathBuf,

@@ -597,7 +597,7 @@ impl AsyncWrite for RequestStream {
 
 #[cfg(test)]
 mod tests {
-    use super::super::settings::Parity;
+    use super::super::parity::Parity;
     use super::*;
 
     #[test]

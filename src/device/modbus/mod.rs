@@ -17,6 +17,7 @@ mod drivers;
 mod link;
 mod machine;
 mod pages_ahead;
+mod parity;
 mod payload_transfer;
 mod protocol;
 mod read_ahead;
@@ -35,6 +36,7 @@ pub use drivers::{ModbusCmm, ModbusGrinder};
 pub(crate) use link::SystemConnector;
 pub use link::{ConnectFuture, Connector, LineStream, Link, LinkStatistics};
 pub use machine::ModbusMachine;
+pub use parity::Parity;
 pub use settings::{
-    LineAddress, ModbusSettings, Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
+    LineAddress, ModbusSettings, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
 };

@@ -6,6 +6,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::parity::Parity;
 use super::serial_port;
 use crate::machine_table::MachineTable;
 use regrind_document::Document;
@@ -81,19 +82,6 @@ impl WordOrder {
         }
         words
     }
-}
-
-/// Parity of a serial line.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum Parity {
-    /// None.
-    None,
-    /// Even.
-    #[default]
-    Even,
-    /// Odd.
-    Odd,
 }
 
 /// Address of a line.

@@ -1,5 +1,6 @@
 //! Serial ports of this computer.
 
+mod names;
 #[cfg(unix)]
 mod unix;
 #[cfg(windows)]
@@ -9,7 +10,8 @@ use std::io;
 
 use tokio_serial::{SerialPortBuilderExt as _, SerialStream};
 
-use super::settings::Parity;
+use super::parity::Parity;
+use names::names;
 
 #[cfg(unix)]
 use unix::is_there;
@@ -40,10 +42,4 @@ pub(crate) fn missing(device: &str) -> Option<String> {
     let names = names();
     let there = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
     Some(format!("the serial port {device} does not exist on this computer; the serial ports here: {there}"))
-}
-
-/// Returns the names of the serial ports that the operating system knows.
-fn names() -> Vec<String> {
-    let ports = serialport::available_ports().unwrap_or_default();
-    ports.into_iter().map(|port| port.port_name).collect()
 }
