@@ -245,7 +245,7 @@ impl RunStart {
     fn prepared(&self, run: &Path, recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), Failure> {
         let (mut task, plan) = setup::prepare(recipe, cell).map_err(Failure::Setup)?;
         if let Some(seed) = self.seed {
-            task.setting.push_str(&format!(", seed {seed}"));
+            task.setting = task.setting.with_seed(seed);
         }
         if let Some(learned) = self.files.get(LEARNED_FROM) {
             let text = learned.read(run).map_err(Failure::Journal)?;
@@ -258,7 +258,7 @@ impl RunStart {
         if identity != self.nominal_sha256 {
             return differs("the nominal surface");
         }
-        if task.setting != self.setting {
+        if !task.setting.fits(&self.setting) {
             return differs("the setting of grinding, measuring and correction");
         }
         if RecordedPlan::new(&plan) != self.plan {

@@ -10,7 +10,7 @@ use regrind::cell::{Actor, CellPlan, Ending, FirstStep, TABLE_VERSION};
 use regrind::config::{BUILT_IN_CELL, CellConfig, LinkConfig};
 use regrind::device::{LineAddress, Wire};
 use regrind::drive::Task;
-use regrind::formats::{KnowledgeOrigin, LEARNED, Learned, LearnedError};
+use regrind::formats::{KnowledgeOrigin, LEARNED, Learned, LearnedError, SettingIdentity};
 use regrind::journal::{AuditKey, Header, Journal, free_bytes, utc_to_the_second};
 use regrind::recipe::Recipe;
 use regrind::record::{PartStart, RecordedPlan, RunContent};
@@ -87,7 +87,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     cell.rehearsal = arguments.rehearsal;
     let (mut task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
     if let Some(seed) = arguments.seed {
-        task.setting.push_str(&format!(", seed {seed}"));
+        task.setting = task.setting.with_seed(seed);
     }
     let earlier = match recipe.compensation.learn {
         true => Some(EarlierKnowledge::apply_newest(&mut task, arguments)?),
@@ -227,7 +227,7 @@ impl EarlierKnowledge {
         Ok(())
     }
 
-    fn newest(runs: &Path, setting: &str, simulated: bool) -> Self {
+    fn newest(runs: &Path, setting: &SettingIdentity, simulated: bool) -> Self {
         let mut earlier = Self::default();
         // Without the folder there are no runs yet.
         let Ok(entries) = std::fs::read_dir(runs) else { return earlier };
@@ -332,7 +332,7 @@ fn header(
             cell_sha256: Some(hex(cell.source_sha256())),
             working_folder: Some(std::env::current_dir().unwrap_or_default().to_string_lossy().into_owned()),
             nominal_sha256: Some(hex(&task.part_identity)),
-            setting: Some(task.setting.clone()),
+            setting: Some(task.setting.id.clone()),
             part_name: Some(recipe.part.name.clone()),
             part_in_files: Some(live.part.to_owned()),
             job: Some(live.job),

@@ -714,12 +714,12 @@ pub(super) fn learned_state(task: &Task, run: String, (cycle, fields): (&CycleSt
     if cycle.figures.as_ref()?.response.is_some_and(|response| wrong.contains(&response)) {
         return None;
     }
-    let (setting, simulation) = (task.setting.clone(), task.simulation);
+    let (setting, simulation) = (task.setting.id.clone(), task.simulation);
     let correction = cycle.correction.compensating(known, cycle.parameter_corrections.as_deref());
     Some(
         Learned::new(simulation, setting, run, correction, known.clone())
             .with_fields(fields)
-            .with_kind(task.kind.clone()),
+            .with_kind(task.kind.id.clone()),
     )
 }
 

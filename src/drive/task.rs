@@ -11,7 +11,9 @@ use crate::compensation::{
 };
 use crate::device::{CarefulStart, Coordinates, CorrectionMap, Identified, Pass, Plan, PlanTarget, TargetKind};
 use crate::formats::gcode::GcodeError;
-use crate::formats::{CellRun, CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
+use crate::formats::{
+    CellRun, CorrectionIdentities, FormatError, Learned, ResultFolder, SettingIdentity, write_correction,
+};
 use crate::geometry::{DeviationSample, Grid, Point, Pose, Vector};
 use crate::measuring::{self, ThermalExpansion, sphere_targets};
 use crate::model::{FIRST_BATCH, Form, Hyperparameters, MachineUncertainty, StoppingCriteria, farthest_points};
@@ -63,10 +65,10 @@ pub struct Task {
     /// State that was learned in earlier runs: correction of the first pass, state of the learning, and priors of the
     /// error field.
     pub learned: Option<Learned>,
-    /// Text of the settings that two runs must share so that one can learn from the other.
-    pub setting: String,
-    /// Text of the settings without the cell, which runs of two cells must share so that one can learn from the other.
-    pub kind: String,
+    /// Settings that two runs must share so that one can learn from the other.
+    pub setting: SettingIdentity,
+    /// Settings without the cell, which runs of two cells must share so that one can learn from the other.
+    pub kind: SettingIdentity,
     /// Limits of a correction.
     pub correction_limits: CorrectionLimits,
     /// Parameters of the machine that are compensated; `None` if the map corrects the whole error.
@@ -377,7 +379,7 @@ impl Task {
     /// The learning treats the error of the surface separately in several bands of wavelengths. Returns `None` if no
     /// state in `others` contains a learned error in the same bands as this task.
     pub fn learned_from_others(&self, others: &[(CellRun, Learned)], alike: &MachineSimilarity) -> Option<Learned> {
-        let of_this = (self.simulation, self.setting.clone());
+        let of_this = (self.simulation, self.setting.id.clone());
         Learned::from_others(others, alike, of_this, (&self.new_learning(), self.zero_correction()))
     }
 

@@ -59,6 +59,29 @@ pub struct KnowledgeOrigin {
     pub comparisons: usize,
 }
 
+/// Identity of settings that two runs must share so that one can learn from the other.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct SettingIdentity {
+    /// Name and hash of a versioned document of the settings. It is written into records and files.
+    pub id: String,
+    /// Text that versions up to 0.2 wrote for the same settings. It is only compared.
+    pub earlier: String,
+}
+
+impl SettingIdentity {
+    /// Returns true if `recorded` identifies the same settings. `recorded` is from a file or a record of this or of an
+    /// earlier version.
+    pub fn fits(&self, recorded: &str) -> bool {
+        recorded == self.id || recorded == self.earlier
+    }
+
+    /// Returns the identity of these settings together with the seed of another simulated part.
+    #[must_use]
+    pub fn with_seed(self, seed: u64) -> Self {
+        Self { id: format!("{}, seed {seed}", self.id), earlier: format!("{}, seed {seed}", self.earlier) }
+    }
+}
+
 /// Run of a cell.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CellRun {
@@ -149,15 +172,19 @@ impl Learned {
     /// Reads the knowledge that a finished run saved in its folder `run`. Returns the knowledge (the learned correction
     /// and the state of the learning) and the bytes of its file.
     ///
-    /// `setting` is the text of the settings of the new run. `simulation` is true if the passes of the new run are
-    /// simulated. Each must be equal to the value in the file.
+    /// `setting` is the identity of the settings of the new run. `simulation` is true if the passes of the new run are
+    /// simulated. Each must fit the value in the file.
     ///
     /// Returns `None` if the file does not exist, has another version of the layout, or has another `setting` or
     /// another value of `simulation`.
     ///
     /// # Errors
     /// A file that cannot be read, is too large, is not written by Regrind, or has an impossible number.
-    pub fn read(run: &Path, setting: &str, simulation: bool) -> Result<Option<(Self, Vec<u8>)>, LearnedError> {
+    pub fn read(
+        run: &Path,
+        setting: &SettingIdentity,
+        simulation: bool,
+    ) -> Result<Option<(Self, Vec<u8>)>, LearnedError> {
         let path = run.join(LEARNED);
         let broken = |reason| LearnedError::Broken { path: path.clone(), reason };
         let text = match read_whole(&path, MAX_BYTES) {
@@ -172,7 +199,7 @@ impl Learned {
         };
         // The head is read first: a file of another part or of an earlier version is ignored without an error.
         let head: Head = serde_json::from_slice(&text).map_err(|error| broken(error.to_string()))?;
-        if head.layout != LAYOUT || head.simulation != simulation || head.setting != setting {
+        if head.layout != LAYOUT || head.simulation != simulation || !setting.fits(&head.setting) {
             return Ok(None);
         }
         Self::from_saved(&path, &text).map(|learned| Some((learned, text)))
@@ -181,18 +208,23 @@ impl Learned {
     /// Parses the knowledge of a run of another cell (the learned correction and the state of the learning) from
     /// `text`, the content of its file. `from` only names the file in messages.
     ///
-    /// `kind` is a text of the settings of the new run, without the settings that belong to its cell. `simulation` is
-    /// true if the passes of this cell are simulated. Each must be equal to the value in `text`.
+    /// `kind` is the identity of the settings of the new run, without the settings that belong to its cell. `simulation`
+    /// is true if the passes of this cell are simulated. Each must fit the value in `text`.
     ///
     /// # Errors
     /// - Regrind did not write `text`, or `text` contains an impossible number.
     /// - The knowledge has another `kind`, another value of `simulation` or another version of the layout.
     /// - The other cell did not learn the knowledge in its own run, but took it from other cells.
     /// - The state of the learning cannot be transferred to another machine.
-    pub fn read_other(from: &Path, text: &[u8], kind: &str, simulation: bool) -> Result<Self, LearnedError> {
+    pub fn read_other(
+        from: &Path,
+        text: &[u8],
+        kind: &SettingIdentity,
+        simulation: bool,
+    ) -> Result<Self, LearnedError> {
         let learned = Self::from_saved(from, text)?;
         let is_meant = learned.layout == LAYOUT
-            && learned.kind.as_deref() == Some(kind)
+            && learned.kind.as_deref().is_some_and(|recorded| kind.fits(recorded))
             && learned.simulation == simulation
             && learned.origin.is_none();
         let broken = |reason| Err(LearnedError::Broken { path: from.to_owned(), reason });
@@ -280,10 +312,14 @@ mod tests {
         Learned::new(true, "a part".into(), "run-1".into(), correction.compensating(&known, None), known)
     }
 
+    fn setting(id: &str) -> SettingIdentity {
+        SettingIdentity { id: id.into(), earlier: format!("{id} of an earlier version") }
+    }
+
     fn read(text: &str) -> Result<Option<(Learned, Vec<u8>)>, LearnedError> {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join(LEARNED), text).unwrap();
-        Learned::read(folder.path(), "a part", true)
+        Learned::read(folder.path(), &setting("a part"), true)
     }
 
     #[test]
@@ -294,7 +330,7 @@ mod tests {
         assert_eq!(bytes, text.as_bytes());
         assert_eq!(serde_json::to_string(&back).unwrap(), text);
         assert!(
-            Learned::read(tempfile::tempdir().unwrap().path(), "", true).unwrap().is_none(),
+            Learned::read(tempfile::tempdir().unwrap().path(), &setting(""), true).unwrap().is_none(),
             "no file is nothing learned"
         );
         // Another grid of the same part: values between the nodes are interpolated, and the level is that of the new
@@ -312,7 +348,8 @@ mod tests {
         let of = |cell: &str| {
             let from = CellRun { cell: cell.into(), run: format!("run-{cell}") };
             let text = serde_json::to_vec(&learned().with_kind("such parts".into())).unwrap();
-            let read = |kind: &str, simulation| Learned::read_other(Path::new("there"), &text, kind, simulation);
+            let read =
+                |kind: &str, simulation| Learned::read_other(Path::new("there"), &text, &setting(kind), simulation);
             assert!(read("other parts", true).is_err() && read("such parts", false).is_err());
             (from, read("such parts", true).unwrap())
         };
@@ -328,7 +365,7 @@ mod tests {
         let back = Learned::from_saved(Path::new("kept"), &text).unwrap();
         assert_eq!((&back.correction, &back.origin), (&begun.correction, &begun.origin));
         let kind = serde_json::to_vec(&begun.with_kind("such parts".into())).unwrap();
-        assert!(Learned::read_other(Path::new("there"), &kind, "such parts", true).is_err());
+        assert!(Learned::read_other(Path::new("there"), &kind, &setting("such parts"), true).is_err());
         assert!(Learned::from_others(&[], &alike, (true, "mine".into()), (&fresh, none)).is_none());
     }
 

@@ -51,7 +51,7 @@ pub use folder::{ResultFolder, ScratchFolder, finished_files, place_link, remove
 pub use form_document::save_form;
 pub use height_map::HeightMap;
 pub use jsonl_appender::JsonlAppender;
-pub use learned::{CellRun, KnowledgeOrigin, LEARNED, Learned, LearnedError};
+pub use learned::{CellRun, KnowledgeOrigin, LEARNED, Learned, LearnedError, SettingIdentity};
 pub use map::{
     CorrectionIdentities, ErrorMapOrigin, MapNode, parse_error_map, read_error_map, write_correction, write_error_map,
 };

@@ -5,7 +5,7 @@ use std::fs;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-use regrind_formats::{CellRun, LEARNED, Learned};
+use regrind_formats::{CellRun, LEARNED, Learned, SettingIdentity};
 use regrind_journal::sha256_hex;
 use serde::Deserialize;
 use tokio_postgres::Row;
@@ -58,14 +58,20 @@ impl Knowledge {
     pub async fn query(
         link: &DatabaseLink,
         artefacts: Option<&ArtefactSettings>,
-        (kind, simulation): (&str, bool),
+        (kind, simulation): (&SettingIdentity, bool),
     ) -> Result<Self, PlantError> {
         let failed = refused("the learned errors of other cells");
         let mut knowledge = Self::default();
         let text = "SELECT $1::text, false, cell, run, sha256, content, place FROM lessons($1, $2)";
-        let rows = link.client().query(text, &[&kind, &simulation]).await.map_err(&failed)?;
-        let of_kind = knowledge.verify_results(link, artefacts, (rows, simulation)).await?;
-        knowledge.results = of_kind.into_iter().map(|given| (given.from, given.learned)).collect();
+        // A cell with results of this version and of an earlier one is asked for those of this version.
+        for kind in [&kind.id, &kind.earlier] {
+            let rows = link.client().query(text, &[kind, &simulation]).await.map_err(&failed)?;
+            let of_kind = knowledge.verify_results(link, artefacts, (rows, simulation)).await?;
+            let is_new =
+                |given: &DeliveredResult| knowledge.results.iter().all(|(known, _)| known.cell != given.from.cell);
+            let of_kind: Vec<DeliveredResult> = of_kind.into_iter().filter(is_new).collect();
+            knowledge.results.extend(of_kind.into_iter().map(|given| (given.from, given.learned)));
+        }
         if knowledge.results.is_empty() {
             return Ok(knowledge);
         }
@@ -132,7 +138,8 @@ fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool
         return Err("it differs from the record".into());
     }
     let place: PathBuf = [&from.cell, &from.run, LEARNED].iter().collect();
-    let learned = Learned::read_other(&place, &content, &kind, simulation).map_err(|error| error.to_string())?;
+    let stated = SettingIdentity { id: kind.clone(), earlier: kind.clone() };
+    let learned = Learned::read_other(&place, &content, &stated, simulation).map_err(|error| error.to_string())?;
     Ok(DeliveredResult { kind, is_own, from, learned })
 }
 

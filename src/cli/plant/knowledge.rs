@@ -40,7 +40,7 @@ pub(super) fn query_knowledge(
         let asked = super::super::runtime().and_then(|runtime| {
             runtime.block_on(async {
                 let link = open(&config).await?;
-                let of_this = (kind.as_str(), simulation);
+                let of_this = (&kind, simulation);
                 let knowledge = Knowledge::query(&link, config.artefacts.as_ref(), of_this).await?;
                 let alike = alike(&knowledge, config.machines_differ);
                 Ok::<_, Failure>((knowledge, alike))
