@@ -3,19 +3,14 @@
 use std::collections::HashMap;
 
 use rayon::prelude::*;
+use spade::{MIN_ALLOWED_VALUE, validate_coordinate};
 
 use crate::geometry::{Point, bounds, find_far_off};
 
 use super::error::SurfaceError;
 use super::mesh_topology::BORDER;
 use super::plane_projection::Projector;
-use super::triangulation::{SortedSites, Triangulation};
-
-/// Triangles and, for each corner, the neighbour across the edge opposite to the corner.
-pub(crate) struct Triangles {
-    pub(crate) corners: Vec<[u32; 3]>,
-    pub(crate) neighbours: Vec<[u32; 3]>,
-}
+use super::triangulation::Triangles;
 
 /// Minimum ratio of height to border edge of a border triangle. A flatter triangle is a needle of the convex hull, not
 /// a piece of the surface.
@@ -32,9 +27,6 @@ const WIDE: f64 = 100.0;
 /// Minimum ratio of the distance of two points to the usual edge length. Nearer points are near-duplicates.
 const TWINS: f64 = 1e-4;
 
-/// Largest accepted coordinate (2^201): the fourth powers of larger ones would overflow.
-const MAX_COORDINATE: f64 = 3.2e60;
-
 /// Triangulates scattered points by the Delaunay method in a plane. The projector `map` projects the points to this
 /// plane. Then removes flat triangles at the convex hull, and triangles that bridge holes.
 ///
@@ -47,20 +39,18 @@ const MAX_COORDINATE: f64 = 3.2e60;
 /// plane, if all points lie on one line, or if one point is far from all other points.
 pub(crate) fn triangulate(points: &[Point], map: &Projector) -> Result<(Vec<Point>, Triangles), SurfaceError> {
     let places: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0.map(flushed_to_zero)).collect();
-    if let Some(index) = places.iter().position(|p| !(p[0].abs() <= MAX_COORDINATE && p[1].abs() <= MAX_COORDINATE)) {
+    if let Some(index) = places.iter().position(|p| p.iter().any(|c| validate_coordinate(*c).is_err())) {
         return Err(SurfaceError::NotFinite { index });
     }
     let along = z_curve_order(&places);
-    let keys: Vec<u64> = along.par_iter().map(|(key, _)| *key).collect();
     let ordered: Vec<[f64; 2]> = along.par_iter().map(|(_, index)| places[*index as usize]).collect();
     if ordered.windows(2).any(|w| w[0] == w[1]) {
         return Err(first_duplicate(points, &places));
     }
-    let (corners, neighbours) = Triangulation::new(SortedSites { places: &ordered, keys: &keys }).faces();
-    if corners.is_empty() {
+    let triangles = Triangles::delaunay(&ordered);
+    if triangles.corners.is_empty() {
         return Err(SurfaceError::Collinear { points: points.len() });
     }
-    let triangles = Triangles { corners, neighbours };
     let lengths = EdgeLengths::new(&triangles, &ordered);
     if let Some(twins) = find_near_duplicates(&triangles, &lengths, &ordered) {
         let [first, second] = twins.map(|k| along[k as usize].1 as usize);
@@ -110,10 +100,10 @@ fn spread_bits(bits: u32) -> u64 {
     (bits | bits << 1) & 0x5555_5555_5555_5555
 }
 
-/// Returns 0 for -0 and for a coordinate closer to zero than 1e-40, whose products would underflow. Returns other
-/// coordinates unchanged.
+/// Returns 0 for -0 and for a coordinate so close to zero that spade refuses it, because its products would underflow.
+/// Returns other coordinates unchanged.
 fn flushed_to_zero(coordinate: f64) -> f64 {
-    if coordinate.abs() < 1e-40 { 0.0 } else { coordinate }
+    if coordinate.abs() < MIN_ALLOWED_VALUE { 0.0 } else { coordinate }
 }
 
 /// Returns an error that names two points at the same place in the plane. `places` contains the plane coordinates (u,
@@ -407,5 +397,11 @@ mod tests {
         let mut doubled = sunflower(50, 0.0);
         doubled.push(doubled[7]);
         assert!(matches!(triangulate(&doubled, &map), Err(SurfaceError::DuplicatePoints { first: 7, second: 50, .. })));
+        let mut huge = sunflower(50, 0.0);
+        huge[9].x = 1e61;
+        assert!(matches!(triangulate(&huge, &map), Err(SurfaceError::NotFinite { index: 9 })));
+        let mut tiny = sunflower(50, 0.0);
+        tiny.push(Point::new(1e-50, -0.0, 0.0));
+        assert_eq!(triangulate(&tiny, &map).unwrap().0.len(), 51);
     }
 }
