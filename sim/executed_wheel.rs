@@ -24,11 +24,11 @@ use std::sync::{Arc, Mutex};
 
 use crate::Vec3;
 use crate::body::Kind;
-use crate::grinder::{cut, smooth};
-use crate::part::{Grooves, HeightGrid, NODE_SPACING_MM, Part};
+use crate::part::{Grooves, HeightGrid, NODE_SPACING_MM};
+use crate::removal::{add_random_error, begin_pass, cut, drift_mm, groove_bend, place_grooves, wheel_radius_mm};
 use crate::shape::project_onto;
-use crate::spec::{SpecError, WorldSpec};
-use crate::truth::{ExecutedPass, Source, WorldState, locked, stream};
+use crate::spec::SpecError;
+use crate::truth::{ExecutedPass, WorldState, locked};
 
 /// Maximum height over the nominal surface at which the wheel counts as being at the part, in mm.
 const NEAR_MM: f64 = 1.0;
@@ -169,9 +169,9 @@ impl Wheel {
         [from_mm, place_mm]: [Vec3; 2],
         [then, seconds]: [f64; 2],
     ) -> Option<WheelProjection> {
-        let error_mm = 1e-3 * state.spec.grinder.wheel_radius_error_um;
         let stated_mm = self.stated_radius_mm;
-        let radius_mm = *state.true_wheel_radius_mm.get_or_insert(stated_mm + error_mm);
+        let radius_mm = wheel_radius_mm(state, stated_mm);
+        state.true_wheel_radius_mm = Some(radius_mm);
         // The lag is specified at 1000 mm/min.
         let lag_s = 1e-3 * state.spec.grinder.following_um * 60.0 / 1000.0;
         let mut centre: Vec3 = std::array::from_fn(|k| {
@@ -214,22 +214,13 @@ impl Wheel {
 
     fn begin(&mut self, state: &mut WorldState, seconds: f64) {
         (self.waiting_track, self.half_mm, self.reached_mm) = (None, None, None);
-        state.on_table = false;
-        state.passes_begun += 1;
-        state.passes_of_blank += 1;
-        let spec = &state.spec.grinder;
-        if spec.dressed_each_pass {
-            state.worn_strokes = 0.0;
-        }
-        let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun);
-        let fresh = smooth(rng, spec.repeatability_correlation_mm, spec.repeatability_um);
+        begin_pass(state);
         let mut fixed_mm = state.systematic_mm.clone();
-        state.part.height.add(&fresh, &mut fixed_mm);
-        let radius_mm = state.true_wheel_radius_mm.unwrap_or(self.stated_radius_mm);
+        add_random_error(state, state.passes_begun, &mut fixed_mm);
         let nodes = state.part.height.nodes().filter(|[x, y]| state.part.aperture.contains(*x, *y)).count() as f64;
         self.pass = Some(PassState {
             fixed_mm,
-            bend: bend(&state.spec, &state.part, radius_mm),
+            bend: groove_bend(state, wheel_radius_mm(state, self.stated_radius_mm)),
             began_s: seconds,
             heat_at_begin: state.heat,
             nodes,
@@ -297,16 +288,6 @@ impl Wheel {
     }
 }
 
-/// Returns, for every node of the part, the curvature in 1/mm of the grooves that a wheel of radius `radius_mm` leaves.
-/// Returns `None` if the specification has no grooves (`scallops` is false).
-fn bend(spec: &WorldSpec, part: &Part, radius_mm: f64) -> Option<HeightGrid> {
-    spec.grinder.scallops.then(|| {
-        let mut bend = HeightGrid::new(part.aperture.half_mm(), 0.0);
-        bend.heights_mm = bend.nodes().map(|at| Grooves::bend_at(part.shape.as_ref(), radius_mm, at)).collect();
-        bend
-    })
-}
-
 /// Updates the position and the spacing of the part's grooves after a track. The first groove is at the first track of
 /// `pass`. The spacing is such that one of the grooves is at `track`. `half_mm` is half the distance between two
 /// tracks, in mm. Does nothing if `half_mm` is `None`.
@@ -320,14 +301,7 @@ fn update_grooves(state: &mut WorldState, pass: &PassState, track: &Track, half_
     if let Some(sweep) = state.executed_passes.last_mut() {
         sweep.spacing_mm = spacing_mm;
     }
-    if pass.bend.is_none() {
-        state.part.grooves = None;
-        return;
-    }
-    let before = state.part.grooves.take().map(|grooves| grooves.bend);
-    let bend = before.unwrap_or_else(|| HeightGrid::new(state.part.aperture.half_mm(), 0.0));
-    let wheel_radius_mm = state.true_wheel_radius_mm.unwrap_or_default();
-    state.part.grooves = Some(Grooves { first_mm, spacing_mm, wheel_radius_mm, bend });
+    place_grooves(state, [first_mm, spacing_mm], state.true_wheel_radius_mm.unwrap_or_default());
 }
 
 /// Grinds the nodes along `track` whose y is within the two limits `strip`, in mm. `beside` lists the sides of the
@@ -340,13 +314,9 @@ fn grind(
     strip: [f64; 2],
     beside: impl Iterator<Item = f64>,
 ) {
-    let spec = &state.spec.grinder;
-    let strokes = |visits: u64| visits as f64 / pass.nodes.max(1.0);
-    let worn = state.worn_strokes;
-    let wear_um = spec.wear_at_um(worn + strokes(pass.visits)) - spec.wear_at_um(worn);
     let seconds = track.projections.last().map_or(0.0, |foot| foot.seconds) - pass.began_s;
-    let heat = 1.0 - (1.0 - pass.heat_at_begin) * (-seconds / spec.thermal_tau_s).exp();
-    let drift_mm = 1e-3 * (wear_um - spec.thermal_um * (heat - pass.heat_at_begin));
+    let heat = state.spec.grinder.heat_after(pass.heat_at_begin, seconds);
+    let drift_mm = drift_mm(state, pass.visits as f64 / pass.nodes.max(1.0), [pass.heat_at_begin, heat]);
     for (node, [x, y], height_mm) in nodes_in_strip(&state.part.height, track, strip) {
         let bend = pass.bend.as_ref().map(|bend| bend.heights_mm[node]);
         let has_cut = cut(state, node, height_mm + pass.fixed_mm[node] + drift_mm, bend);

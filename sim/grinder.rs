@@ -1,25 +1,16 @@
-//! Grinder: the path of the wheel, the surface that it leaves, and why that differs from the commanded surface.
+//! Grinder that carries out passes: the path of the wheel, its strokes, and the height that each stroke wants.
 //!
-//! At every node of the part's grid, at the moment when the wheel is there, a stiff machine would leave the surface at
-//! this height over the nominal:
+//! The grinder is one source of motion of the removal model ([`crate::removal`]). At every node the wanted height is
 //!
 //! ```text
-//!  cmd = level + u + S + F + W(t) - T(t) + N
+//!  wanted = level + u + R + F
 //!
-//!  level, u   commanded by the client: the level of the pass, and the map
-//!  S          systematic error, the same in every pass: wheel radius, setting, straightness, screw, waviness
+//!  level, u   commanded by the client: the level of the pass, and the map; or the height of a program that it reads
+//!  R          error of the wheel's radius, on slopes
 //!  F          following error: the axes lag, on alternate tracks to alternate sides
-//!  W, T       wear of the wheel (leaves more) and growth of the spindle (leaves less), both along the path
-//!  N          random error of each pass, which no compensation can remove
 //! ```
 //!
-//! Machine and part deflect, so a share mu of the excess height remains: h becomes mu h + (1 - mu) cmd where h > cmd.
-//! The wheel cuts air if h <= cmd. Spark-out repeats the stroke.
-//!
-//! **Scallops.** The wheel is a ball. Where it cuts, it leaves a groove around each track: h is the bottom of the
-//! grooves, and the ridges between them belong to the part that is measured ([`crate::part`]). Grooves lie at the
-//! tracks of the last pass. Where that pass was broken off or cut air, the grooves of the pass before keep their
-//! height.
+//! Spark-out repeats the stroke.
 //!
 //! **Depth of cut.** Roughing strokes first remove the material that is more than the depth of cut above cmd. Each
 //! removes at most the depth of cut, with ten times the feed and a wheel of its own (no wear, no growth). They leave at
@@ -36,13 +27,15 @@ use std::sync::{Arc, Mutex};
 
 use crate::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
 use crate::followed_surface;
-use crate::form::FormError;
 use crate::head::Head;
-use crate::part::{Grooves, HeightGrid, Part};
+use crate::part::{HeightGrid, Part};
 use crate::payload::{BROKEN, INTERLOCK, Map, Pass, PassRecord, outside};
 use crate::program::{Control, Program};
-use crate::spec::{GrinderSpec, Mirrored, Misreported, WorldSpec};
-use crate::truth::{GrindEntry, Source, WorldState, empty_result, locked, stream};
+use crate::removal::{
+    add_random_error, begin_pass, cut, drift_mm, finite_or_zero, groove_bend, place_grooves, wheel_radius_mm,
+};
+use crate::spec::{Mirrored, Misreported};
+use crate::truth::{GrindEntry, WorldState, empty_result, locked};
 
 /// Maximum number of strokes of a pass, roughing and finishing together.
 pub const MAX_STROKES: u32 = 400;
@@ -50,55 +43,6 @@ pub const MAX_STROKES: u32 = 400;
 pub const OVERTRAVEL_MM: f64 = 1.5;
 /// Ratio of the feed of a roughing stroke to that of a finishing stroke.
 const ROUGHING_FEED: f64 = 10.0;
-
-impl GrinderSpec {
-    /// Returns the systematic error of the grinder at (x, y) of a part, in µm: setting, tilt, straightness and screw
-    /// errors. The error of the wheel's radius is not included.
-    fn systematic_um(&self, part: &Part, [x, y]: [f64; 2]) -> f64 {
-        let [half_x, half_y] = part.aperture.half_mm();
-        let [p, q] = part.shape.gradient(x, y);
-        let nz = 1.0 / (1.0 + p * p + q * q).sqrt();
-        let [ex, ey] = self.setting_error_um;
-        let setting = nz * (p * ex + q * ey + self.setting_error_z_um);
-        // Grinding a part tilted by a about a point of its frame leaves the opposite tilt: -a . (r x n), n = nz (-p,
-        // -q, 1).
-        let z = part.shape.height(x, y);
-        let [about_x, about_y] = self.part_tilt_urad.map(|tilt| 1e-3 * tilt);
-        let tilt = -nz * (about_x * (y + q * z) - about_y * (x + p * z));
-        let straight =
-            |t: f64, [second, third]: [f64; 2]| second * (1.5 * t * t - 0.5) + third * (2.5 * t * t * t - 1.5 * t);
-        let straightness = straight(x / half_x, self.straightness_x_um) + straight(y / half_y, self.straightness_y_um);
-        let screw = self.periodic_um * (std::f64::consts::TAU * x / self.periodic_pitch_mm + 0.7).sin();
-        finite_or_zero(setting + tilt + straightness + screw)
-    }
-
-    /// Returns the wear of the wheel after a number of finishing strokes since it was dressed, in µm.
-    pub(crate) fn wear_at_um(&self, strokes: f64) -> f64 {
-        let fast = if self.break_in_share > 0.0 { 1.0 - (-strokes / self.break_in_share).exp() } else { 0.0 };
-        self.wear_um * strokes + self.break_in_um * fast
-    }
-}
-
-/// Returns the value, or 0 if it is infinite or NaN. The formulas of the surface can give such values at the corners of
-/// the grid of a round part.
-pub(crate) fn finite_or_zero(value: f64) -> f64 {
-    if value.is_finite() { value } else { 0.0 }
-}
-
-/// Returns the systematic error of the grinder at every node of `part`, in mm. The error contains the errors of
-/// setting, tilt, straightness and screw pitch, and the random waviness that is the same in every pass. It does not
-/// contain the error of the wheel's radius.
-pub(crate) fn systematic_mm(spec: &WorldSpec, part: &Part) -> Vec<f64> {
-    let (seed, spec) = (spec.seed, &spec.grinder);
-    let waves = smooth(&mut stream(seed, Source::Waviness, 0), spec.waviness_correlation_mm, spec.waviness_um);
-    let mut error_mm: Vec<f64> = part.height.nodes().map(|place| 1e-3 * spec.systematic_um(part, place)).collect();
-    part.height.add(&waves, &mut error_mm);
-    error_mm
-}
-
-pub(crate) fn smooth(rng: &mut crate::Rng, correlation_mm: f64, rms_um: f64) -> FormError {
-    if rms_um > 0.0 { FormError::with_rms(rng, correlation_mm, rms_um * 1e-3) } else { FormError::none() }
-}
 
 /// Stroke of the wheel over the whole part.
 #[derive(Clone, Copy, Debug)]
@@ -120,8 +64,8 @@ struct Run {
     order: Vec<(f64, u32)>,
     /// Error that does not change along the path, for every node, in mm.
     fixed_mm: Vec<f64>,
-    /// Grooves that the wheel leaves where it cuts.
-    grooves: Option<Grooves>,
+    /// Curvature of the grooves that the wheel leaves where it cuts, for every node in 1/mm.
+    bend: Option<HeightGrid>,
     strokes: Vec<Stroke>,
     stroke_mm: f64,
     total_s: f64,
@@ -144,10 +88,6 @@ impl Run {
         self.elapsed_s >= self.total_s
     }
 
-    fn heat_at(&self, spec: &GrinderSpec, seconds: f64) -> f64 {
-        1.0 - (1.0 - self.heat_at_begin) * (-seconds / spec.thermal_tau_s).exp()
-    }
-
     /// Grinds every node that the wheel has reached up to the present time of the job.
     fn grind(&mut self, state: &mut WorldState) {
         while let Some(stroke) = self.strokes.get(self.stroke).copied() {
@@ -164,14 +104,12 @@ impl Run {
     }
 
     fn cut(&mut self, state: &mut WorldState, stroke: Stroke, moment: f64, node: usize) {
-        let spec = &state.spec.grinder;
         let drift_mm = stroke.above_mm.unwrap_or_else(|| {
             let strokes = (moment - self.finishing_s) * stroke.feed_mm_s / self.stroke_mm;
-            let worn = spec.wear_at_um(state.worn_strokes + strokes) - spec.wear_at_um(state.worn_strokes);
-            let grown = self.heat_at(spec, moment) - self.heat_at(spec, self.finishing_s);
-            1e-3 * (worn - spec.thermal_um * grown)
+            let heat_at = |seconds| state.spec.grinder.heat_after(self.heat_at_begin, seconds);
+            drift_mm(state, strokes, [self.finishing_s, moment].map(heat_at))
         });
-        let bend = self.grooves.as_ref().map(|cut| cut.bend.heights_mm[node]);
+        let bend = self.bend.as_ref().map(|bend| bend.heights_mm[node]);
         self.visits += 1;
         if !cut(state, node, self.fixed_mm[node] + drift_mm, bend) {
             self.in_air += 1;
@@ -209,24 +147,6 @@ impl Run {
             wheel_radius_mm: self.pass.wheel_radius_mm,
         }
     }
-}
-
-/// Grinds the node with the index `node`. `cmd_mm` is the height in mm that an infinitely stiff machine would leave. A
-/// real machine deflects: the fraction `error_copying` of the height above `cmd_mm` remains. `bend` is the curvature in
-/// 1/mm of the groove that the wheel leaves, or `None` for a wheel without grooves. Returns true if the wheel removed
-/// material. Returns false and changes nothing if the node is not higher than `cmd_mm`, or if the fault `no_part` is
-/// configured.
-pub(crate) fn cut(state: &mut WorldState, node: usize, cmd_mm: f64, bend: Option<f64>) -> bool {
-    let h = &mut state.part.height.heights_mm[node];
-    if state.spec.faults.no_part || *h <= cmd_mm {
-        return false;
-    }
-    let mu = state.spec.grinder.error_copying;
-    *h = mu * *h + (1.0 - mu) * cmd_mm;
-    if let (Some(left), Some(bend)) = (&mut state.part.grooves, bend) {
-        left.bend.heights_mm[node] = bend;
-    }
-    true
 }
 
 /// Returns `record` with one false value, to simulate a fault. `misreported` selects the value, for example the path
@@ -271,9 +191,7 @@ fn grown([x0, x1, y0, y1]: [f64; 4]) -> [f64; 4] {
 /// from `program` if there is one, otherwise from `map`. The height is NaN at nodes that the program does not reach.
 fn fixed_mm(state: &WorldState, map: &Map, pass: &Pass, program: Option<&Program>) -> Vec<f64> {
     let (spec, part) = (&state.spec.grinder, &state.part);
-    let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun + 1);
-    let fresh = smooth(rng, spec.repeatability_correlation_mm, spec.repeatability_um);
-    let true_radius_mm = true_radius_mm(state, pass);
+    let true_radius_mm = wheel_radius_mm(state, pass.wheel_radius_mm);
     let y0 = grown(pass.extent_mm)[2];
     let lag_mm = 1e-3 * spec.following_um * pass.feed_mm_min / 1000.0;
     let followed =
@@ -293,24 +211,8 @@ fn fixed_mm(state: &WorldState, map: &Map, pass: &Pass, program: Option<&Program
         wanted + systematic + finite_or_zero(wheel + following)
     });
     let mut steered: Vec<f64> = steered.collect();
-    part.height.add(&fresh, &mut steered);
+    add_random_error(state, state.passes_begun + 1, &mut steered);
     steered
-}
-
-/// Returns the true radius of the wheel in mm. If `state` already contains the true radius from an earlier pass,
-/// returns this radius. Otherwise returns the radius stated in `pass` plus the radius error of the specification.
-fn true_radius_mm(state: &WorldState, pass: &Pass) -> f64 {
-    state.true_wheel_radius_mm.unwrap_or(pass.wheel_radius_mm + 1e-3 * state.spec.grinder.wheel_radius_error_um)
-}
-
-/// Returns the grooves that the wheel would leave in this pass if it cut everywhere on the part: their curvature at
-/// every node, the first track and the spacing of the tracks.
-fn grooves(state: &WorldState, pass: &Pass) -> Grooves {
-    let wheel_radius_mm = true_radius_mm(state, pass);
-    let part = &state.part;
-    let mut bend = HeightGrid::new(part.aperture.half_mm(), 0.0);
-    bend.heights_mm = bend.nodes().map(|at| Grooves::bend_at(part.shape.as_ref(), wheel_radius_mm, at)).collect();
-    Grooves { first_mm: grown(pass.extent_mm)[2], spacing_mm: pass.track_spacing_mm, wheel_radius_mm, bend }
 }
 
 /// Returns the displacement in mm that the machine applies at (x, y). Without faults, this is the displacement of `map`
@@ -461,7 +363,7 @@ fn run(
     (pass, program): (Pass, Option<&Program>),
 ) -> Result<Run, Refusal> {
     let fixed_mm = fixed_mm(state, map, &pass, program);
-    let grooves = state.spec.grinder.scallops.then(|| grooves(state, &pass));
+    let bend = groove_bend(state, wheel_radius_mm(state, pass.wheel_radius_mm));
     let (mut order, stroke_mm) = raster(&state.part, &pass);
     // Nodes that the program does not reach are not ground.
     order.retain(|&(_, node)| fixed_mm[node as usize].is_finite());
@@ -482,7 +384,7 @@ fn run(
         pass,
         order,
         fixed_mm,
-        grooves,
+        bend,
         strokes,
         stroke_mm,
         total_s,
@@ -569,14 +471,9 @@ impl Physics for Grinder {
             return;
         }
         state.part_identity = Some(run.pass.nominal);
-        state.passes_begun += 1;
-        state.passes_of_blank += 1;
-        let error_mm = 1e-3 * state.spec.grinder.wheel_radius_error_um;
-        state.true_wheel_radius_mm.get_or_insert(run.pass.wheel_radius_mm + error_mm);
-        state.on_table = false;
-        if state.spec.grinder.dressed_each_pass {
-            state.worn_strokes = 0.0;
-        }
+        begin_pass(&mut state);
+        let radius_mm = wheel_radius_mm(&state, run.pass.wheel_radius_mm);
+        state.true_wheel_radius_mm = Some(radius_mm);
         let entry = GrindEntry {
             job: run.job,
             cycle: run.cycle,
@@ -589,11 +486,7 @@ impl Physics for Grinder {
         };
         state.history.push(entry);
         run.before_mm = state.part.height.heights_mm.clone();
-        state.part.grooves = run.grooves.as_ref().map(|cut| {
-            let before = state.part.grooves.take().map(|grooves| grooves.bend);
-            let bend = before.unwrap_or_else(|| HeightGrid::new(state.part.aperture.half_mm(), 0.0));
-            Grooves { bend, ..cut.clone() }
-        });
+        place_grooves(&mut state, [grown(run.pass.extent_mm)[2], run.pass.track_spacing_mm], radius_mm);
         self.running = Some(run);
     }
 
@@ -626,7 +519,7 @@ impl Physics for Grinder {
         let duration_s = run.elapsed_s.min(run.total_s);
         let misreported = state.spec.faults.misreported;
         let spec = &state.spec.grinder;
-        state.heat = run.heat_at(spec, duration_s);
+        state.heat = spec.heat_after(run.heat_at_begin, duration_s);
         state.worn_strokes += (duration_s - run.finishing_s).max(0.0) * run.pass.feed_mm_min / 60.0 / run.stroke_mm;
         if let Some(entry) = state.history.last_mut() {
             (entry.result, entry.volume_mm3) = (result, record.volume_mm3);

@@ -13,10 +13,11 @@
 //!  truth      state that the two machines share, and the source of every random number
 //!  world      the two machines, and queries for tests
 //!  part       the part as it really is, and exact contact with it
-//!  process    the grinder: the surface that a pass leaves, node by node along its path
-//!  executed   the grinder with an external controller: the surface along the executed path
+//!  removal    the surface that a pass leaves at a node, for every grinder; its sources of motion are:
+//!  grinder      strokes of a pass over a map, or over a program that the grinder reads
+//!  followed_surface  the heights of that program
+//!  executed_wheel    the path that a controller executes
 //!  program    reader of programs, as a control reads them
-//!  follow     the surface left by a wheel that follows a program
 //!  cmm        the measuring machine: its result of a plan
 //!  payload    the bytes of docs/modbus.md
 //!
@@ -61,6 +62,7 @@ pub mod probe;
 pub mod program;
 pub mod register_encoding;
 pub mod registers;
+mod removal;
 pub mod rsh;
 pub mod shape;
 pub mod spec;

@@ -13,9 +13,10 @@ use std::sync::{Arc, Mutex};
 
 use crate::cmm::{Cmm, TouchProbe};
 use crate::executed_wheel::Wheel;
-use crate::grinder::{Grinder, systematic_mm};
+use crate::grinder::Grinder;
 use crate::part::{Approach, Contact};
 use crate::probe::Placement;
+use crate::removal::systematic_mm;
 use crate::spec::{SpecError, WorldFaults, WorldSpec};
 use crate::truth::{ExecutedPass, GrindEntry, WorldState, locked};
 use crate::wheel::PlainWheel;
