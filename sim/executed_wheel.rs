@@ -1,16 +1,14 @@
-//! Grinder with an external controller: the surface that the wheel leaves along the path that the controller really
-//! executes, servo cycle by servo cycle.
+//! Wheel along the path that a controller executes, position by position: that of a LinuxCNC elsewhere, servo cycle by
+//! servo cycle ([`crate::wire::executed_path`]), or that of the simulated one ([`crate::rsh`]).
 //!
-//! There are no pass registers and no map here. Only the executed positions of the wheel's centre are known. Each
-//! position c, in the frame of the part, gives its projection (foot) on the nominal surface, and the height that a
-//! stiff machine would leave there,
+//! This is one source of motion of the removal model ([`crate::removal`]). There are no pass registers and no map here.
+//! Only the executed positions of the wheel's centre are known. Each position c, in the frame of the part, gives its
+//! projection (foot) on the nominal surface, and the wanted height there:
 //!
 //! ```text
-//!  h = (c' - foot) . n - R        R the true radius of the wheel
+//!  wanted = (c' - foot) . n - R   R the true radius of the wheel
 //!  c' = c + (R - stated) z - lag  touched off at its lowest place; the axes lag behind along the path
 //! ```
-//!
-//! plus the systematic errors, wear, growth, and the random error of the pass, as in [`crate::grinder`].
 //!
 //! **Tracks.** A track begins when the wheel comes near the part, and ends when it lifts off or turns back in x. A
 //! track grinds the strip half way to its neighbours, with the depth at its own y: the ridges between are the
@@ -18,7 +16,8 @@
 //! comes. Beyond the outermost track, the wheel leaves its own curve. Tracks must run along x.
 //!
 //! **Passes.** A pass lasts from when the wheel comes to the part until the part is taken away; the wheel is dressed
-//! before.
+//! before. A controller that knows its programs clamps the part for each of them ([`Wheel::clamp_part`]); then each
+//! program is a pass, and keeps the part to its end.
 
 use std::sync::{Arc, Mutex};
 
@@ -71,7 +70,7 @@ struct PassState {
     first_mm: Option<f64>,
 }
 
-/// Wheel of a grinder with an external controller.
+/// Wheel of a grinder whose controller executes programs.
 pub struct Wheel {
     world: Arc<Mutex<WorldState>>,
     stated_radius_mm: f64,
@@ -88,6 +87,8 @@ pub struct Wheel {
     side: f64,
     /// y of the border up to which strips are ground, in mm.
     reached_mm: Option<f64>,
+    /// True if the grinder keeps the part although the wheel has lifted off.
+    is_clamped: bool,
 }
 
 impl Wheel {
@@ -95,20 +96,35 @@ impl Wheel {
         if !(0.1..=1000.0).contains(&stated_radius_mm) {
             return Err(SpecError { key: "radius of the wheel", value: stated_radius_mm, limit: "0.1 to 1000 mm" });
         }
-        let (last, guess_mm, pass, feet, waiting) = (None, [0.0; 2], None, Vec::new(), None);
-        let (half_mm, side, reached_mm) = (None, 1.0, None);
         Ok(Self {
             world,
             stated_radius_mm,
-            last,
-            guess_mm,
-            pass,
-            projections: feet,
-            waiting_track: waiting,
-            half_mm,
-            side,
-            reached_mm,
+            last: None,
+            guess_mm: [0.0; 2],
+            pass: None,
+            projections: Vec::new(),
+            waiting_track: None,
+            half_mm: None,
+            side: 1.0,
+            reached_mm: None,
+            is_clamped: false,
         })
+    }
+
+    /// Clamps the part in the grinder at the start of a program, which begins a new pass. Returns true if the part is
+    /// in the grinder, and false if the other machine has the part.
+    pub fn clamp_part(&mut self) -> bool {
+        let mut state = locked(&self.world);
+        (self.pass, state.on_table) = (None, false);
+        self.is_clamped = state.claim_part(Kind::Grinder);
+        self.is_clamped
+    }
+
+    /// Moves the wheel away from the part, and grinds its last track. The other machine can then take the part.
+    pub fn release_part(&mut self) {
+        self.is_clamped = false;
+        self.set_position_unknown();
+        self.finish_waiting_track();
     }
 
     /// Moves the wheel's centre to `place_mm`, in the frame of the part, and simulates the grinding on the way.
@@ -209,7 +225,9 @@ impl Wheel {
 
     fn lift_off(&mut self, state: &mut WorldState) {
         self.end_track(state);
-        state.release(Kind::Grinder);
+        if !self.is_clamped {
+            state.release(Kind::Grinder);
+        }
     }
 
     fn begin(&mut self, state: &mut WorldState, seconds: f64) {
@@ -283,7 +301,7 @@ impl Wheel {
     fn is_neighbour(&self, step: f64) -> bool {
         match self.half_mm {
             Some(half) => (0.4 * half..=6.0 * half).contains(&step.abs()),
-            None => (1e-3..=5.0).contains(&step.abs()),
+            None => (1e-3..=10.0).contains(&step.abs()),
         }
     }
 }

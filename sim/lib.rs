@@ -30,7 +30,6 @@
 //!  registers  a whole machine: what a Modbus client reads and writes
 //!  dme        a server of I++ DME, commanded touch by touch
 //!  rsh        a LinuxCNC controller, commanded program by program
-//!  wheel      the surface left by a wheel that a program moves
 //!  faults     faults of one of these three
 //!  hits       a machine that prints a line for each touch, and receives nothing
 //!  seen       events of the machine
@@ -68,7 +67,6 @@ pub mod shape;
 pub mod spec;
 pub mod transfer;
 pub mod truth;
-pub mod wheel;
 pub mod wire;
 pub mod world;
 

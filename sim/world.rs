@@ -19,7 +19,6 @@ use crate::probe::Placement;
 use crate::removal::systematic_mm;
 use crate::spec::{SpecError, WorldFaults, WorldSpec};
 use crate::truth::{ExecutedPass, GrindEntry, WorldState, locked};
-use crate::wheel::PlainWheel;
 
 /// Simulated cell. Clones share one truth.
 #[derive(Clone)]
@@ -64,21 +63,10 @@ impl World {
         TouchProbe::new(self.state.clone())
     }
 
-    /// Returns the wheel of the grinder, for a controller that moves the wheel from position to position. The surface
-    /// between two tracks is interpolated, and single grooves are not modelled; see [`crate::wheel`]. `stated_mm` is
-    /// the radius of the wheel that the controller assumes, in mm.
+    /// Returns the wheel of the grinder, for a controller that executes programs. The wheel grinds along the executed
+    /// path, groove by groove. `stated_radius_mm` is the radius of the wheel that the controller assumes.
     ///
-    /// A world has only one grinder, so use only one of [`World::plain_wheel`], [`World::wheel`] and
-    /// [`World::grinder`].
-    pub fn plain_wheel(&self, stated_mm: f64) -> PlainWheel {
-        PlainWheel::new(self.state.clone(), stated_mm)
-    }
-
-    /// Returns the wheel of the grinder, for an external controller that reports its executed path. The wheel grinds
-    /// along this path, groove by groove. `stated_radius_mm` is the radius of the wheel that the controller assumes.
-    ///
-    /// A world has only one grinder, so use only one of [`World::wheel`], [`World::plain_wheel`] and
-    /// [`World::grinder`].
+    /// A world has only one grinder, so use only one of [`World::wheel`] and [`World::grinder`].
     ///
     /// # Errors
     /// The radius is outside 0.1 mm to 1000 mm.

@@ -21,7 +21,7 @@ use std::io::Write;
 use std::time::Duration;
 
 use crate::Vec3;
-use crate::wheel::PlainWheel;
+use crate::executed_wheel::Wheel;
 use event::{ControllerEvent, Observer};
 use faults::{Fault, LineFaults};
 use program::{LogAction, Program, Step, says};
@@ -64,7 +64,7 @@ enum Interpreter {
 
 /// Controller, and the machine that it moves.
 pub struct Controller {
-    wheel: PlainWheel,
+    wheel: Wheel,
     faults: LineFaults,
     /// Seconds of the machine's time in a real second.
     speed: f64,
@@ -82,6 +82,8 @@ pub struct Controller {
     /// Number of the line at which a travel limit is reached.
     limit_at: Option<u32>,
     at_mm: Vec3,
+    /// Time of the machine at this position, in s.
+    clock_s: f64,
     errors: VecDeque<String>,
     log: Option<String>,
     last_time: Duration,
@@ -93,7 +95,7 @@ impl Controller {
     /// Creates a controller that is switched on and homed, with no program open. `wheel` is the simulated wheel that
     /// the controller moves. `speed` is the number of simulated seconds in one real second. `faults` contains the
     /// faults that happen at certain lines of a client.
-    pub fn new(wheel: PlainWheel, speed: f64, faults: LineFaults) -> Self {
+    pub fn new(wheel: Wheel, speed: f64, faults: LineFaults) -> Self {
         Self {
             wheel,
             faults,
@@ -110,6 +112,7 @@ impl Controller {
             line: 0,
             limit_at: None,
             at_mm: AWAY_MM,
+            clock_s: 0.0,
             errors: VecDeque::new(),
             log: None,
             last_time: Duration::ZERO,
@@ -426,7 +429,7 @@ impl Controller {
         let (path, text) = (program.path.clone(), program.text.clone());
         (self.interpreter, self.line) = (Interpreter::Running, 1);
         self.steps.clear();
-        if !self.wheel.claim_part() {
+        if !self.wheel.clamp_part() {
             self.errors.push_back("the clamp is empty".to_owned());
         }
         self.notify(ControllerEvent::Began { path, text });
@@ -504,7 +507,7 @@ impl Controller {
                     }
                     let way_mm = (0..3).map(|k| (to_mm[k] - self.at_mm[k]).powi(2)).sum::<f64>().sqrt();
                     let goes_mm = (left_s * mm_s).min(way_mm);
-                    self.go(to_mm, way_mm, goes_mm);
+                    self.go(to_mm, [way_mm, goes_mm], mm_s);
                     if goes_mm < way_mm {
                         return;
                     }
@@ -517,7 +520,7 @@ impl Controller {
                 }
                 Step::Wait { line } => {
                     self.line = line;
-                    self.wheel.finish_sweep();
+                    self.wheel.finish_waiting_track();
                     self.program.iter_mut().for_each(Program::go_on);
                 }
                 Step::End { line } => {
@@ -529,16 +532,19 @@ impl Controller {
         }
     }
 
-    fn go(&mut self, to_mm: Vec3, way_mm: f64, goes_mm: f64) {
+    /// Moves the wheel at the speed `mm_s` along the first `goes_mm` of the straight way to `to_mm`, which is `way_mm`
+    /// long.
+    fn go(&mut self, to_mm: Vec3, [way_mm, goes_mm]: [f64; 2], mm_s: f64) {
         let from = self.at_mm;
         let place = |mm: f64| -> Vec3 {
             std::array::from_fn(|k| if mm >= way_mm { to_mm[k] } else { from[k] + (to_mm[k] - from[k]) * mm / way_mm })
         };
         let pieces = (goes_mm / STEP_MM).ceil().max(1.0) as u32;
         for piece in 1..=pieces {
-            self.wheel.move_to(place(goes_mm * f64::from(piece) / f64::from(pieces)));
+            let mm = goes_mm * f64::from(piece) / f64::from(pieces);
+            self.wheel.move_to(place(mm), self.clock_s + mm / mm_s);
         }
-        self.at_mm = place(goes_mm);
+        (self.at_mm, self.clock_s) = (place(goes_mm), self.clock_s + goes_mm / mm_s);
     }
 
     fn end(&mut self) {

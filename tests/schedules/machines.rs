@@ -221,7 +221,7 @@ fn by_programs(
     (log, machine_events, cues): (&Log, &RshDeeds, &Cues),
 ) -> SharedController {
     let radius_mm = setting(RequiredQuality::Good).recipe.grinding.wheel.radius_mm();
-    let mut controller = Controller::new(world.plain_wheel(radius_mm), speed, faults);
+    let mut controller = Controller::new(world.wheel(radius_mm).unwrap(), speed, faults);
     let (log, machine_events, cues) = (log.clone(), machine_events.clone(), cues.clone());
     controller.set_observer(Box::new(move |event| {
         let at = Instant::now();
