@@ -28,6 +28,7 @@
 //!  options    options of a machine, with its register map
 //!  handshake  one machine's side of the handshake: states, interlocks, silence
 //!  registers  a whole machine: what a Modbus client reads and writes
+//!  line_server  what dme and rsh have in common for their wires
 //!  dme        a server of I++ DME, commanded touch by touch
 //!  rsh        a LinuxCNC controller, commanded program by program
 //!  faults     faults of one of these three
@@ -52,6 +53,7 @@ pub mod grinder;
 mod handshake;
 pub mod head;
 pub mod hits;
+pub mod line_server;
 pub mod motion;
 pub mod options;
 pub mod part;

@@ -27,18 +27,7 @@ use faults::{CommandFaults, Fault};
 use line::{Command, DmeError, Tag};
 use machine::{CommandResult, DmeMachine};
 
-/// Line to send, or the end of the connection.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Outgoing {
-    /// Time to send it, in the caller's time.
-    pub at: Duration,
-    /// Line, with its line end.
-    pub text: String,
-    /// True if the line is sent byte by byte.
-    pub split: bool,
-    /// True if the connection closes after the line.
-    pub closes: bool,
-}
+use crate::line_server::{LineServer, Outgoing, take_due};
 
 /// Command that is being carried out.
 struct Running {
@@ -99,24 +88,10 @@ impl Server {
         &mut self.machine
     }
 
-    /// Handles the loss of the client at the time `now`. The running command continues to its end, and the waiting
-    /// commands are dropped.
-    pub fn client_lost(&mut self, now: Duration) {
-        self.waiting.clear();
-        self.out.clear();
-        // A command whose acknowledgement was delayed has not begun yet, so it is dropped.
-        if self.running.as_ref().is_some_and(|running| running.began > now) {
-            self.abandon(now, &DmeError::new(6, ""));
-            self.out.clear();
-        }
-        self.running.iter_mut().for_each(|running| running.client_gone = true);
-        (self.in_session, self.latched) = (false, false);
-    }
-
     /// Restarts the server at the time `now`. The running command is interrupted where the machine is at that time.
     /// Waiting commands are dropped, and the session ends. The machine must be homed again.
     pub fn restart(&mut self, now: Duration) {
-        self.client_lost(now);
+        self.client_lost(0, now);
         self.abandon(now, &DmeError::new(500, "restart"));
         self.out.clear();
         self.latched = false;
@@ -140,13 +115,6 @@ impl Server {
         self.running.as_ref().is_some_and(|running| machine::moves(&running.command.name))
     }
 
-    /// Returns the earliest time at which the server has something to send, if the client sends nothing more. Returns
-    /// `None` if no line is queued and no command runs.
-    pub fn due(&self) -> Option<Duration> {
-        let running = self.running.as_ref().map(|running| running.next(self.speed));
-        running.into_iter().chain(self.out.front().map(|out| out.at)).min()
-    }
-
     /// Simulates an emergency stop at the time `now`. The running command and all waiting commands end with error 500.
     /// The server then refuses commands until the client sends ClearAllErrors.
     pub fn emergency_stop(&mut self, now: Duration) {
@@ -154,55 +122,6 @@ impl Server {
         self.notify(&[MachineEvent::Stopped]);
         self.latched = true;
         self.say(now, format!("E0000 ! {}", DmeError::new(500, "emergency")));
-    }
-
-    /// Advances the simulation to the time `now`. Returns the lines that the server must send to the client up to this
-    /// time, and removes these lines from the queue.
-    pub fn tick(&mut self, now: Duration) -> Vec<Outgoing> {
-        self.advance_time(now);
-        let mut due = Vec::new();
-        while self.out.front().is_some_and(|out| out.at <= now) {
-            due.extend(self.out.pop_front());
-        }
-        due
-    }
-
-    /// Advances the simulation to the time `now`. The lines that become due stay queued for [`Self::tick`].
-    pub fn advance_time(&mut self, now: Duration) {
-        while self.running.as_ref().is_some_and(|running| running.next(self.speed) <= now) {
-            if self.say_scanned() {
-                continue;
-            }
-            self.finish();
-            self.begin_next(now);
-        }
-    }
-
-    /// Handles the line `text` from the client, received at the time `now`. `text` has no line end. An event command is
-    /// carried out at once, any other command is queued. An invalid line is answered with an error.
-    pub fn receive(&mut self, text: &str, now: Duration) {
-        match line::read(text) {
-            Err((tag, error)) => {
-                let tag = tag.unwrap_or(Tag::UNSOLICITED);
-                self.say(now, format!("{tag} &"));
-                self.fail(tag, &error, now);
-                self.say(now, format!("{tag} %"));
-            }
-            Ok((tag, command)) if tag.is_event() => self.run_event_command(tag, &command, now),
-            Ok((tag, command)) => {
-                let fault = self.faults.next_at(|name| *name == command.name);
-                if fault == Some(Fault::EmergencyStop) {
-                    return self.emergency_stop(now);
-                }
-                let late = if let Some(Fault::LateAcknowledgement(late)) = fault { late } else { Duration::ZERO };
-                let ack = Outgoing { at: now + late, text: format!("{tag} &\r\n"), split: false, closes: false };
-                self.out.push_back(ack);
-                self.waiting.push_back((tag, command.with(fault)));
-                if self.running.is_none() {
-                    self.begin_next(now + late);
-                }
-            }
-        }
     }
 
     fn run_event_command(&mut self, tag: Tag, command: &Command, now: Duration) {
@@ -388,5 +307,83 @@ impl Server {
         let at = self.out.back().map_or(at, |last| last.at.max(at));
         let text = if text.is_empty() { text } else { text + "\r\n" };
         self.out.push_back(Outgoing { at, text, split: false, closes: false });
+    }
+}
+
+impl LineServer for Server {
+    const LINE_ENDS: &'static [u8] = b"\n";
+    const MAX_LINE_LENGTH: usize = 65_536;
+    const ONE_CLIENT_AT_A_TIME: bool = true;
+
+    /// Returns true for an event command, which is carried out at once, before the queued commands.
+    fn is_urgent(line: &str) -> bool {
+        line.starts_with('E')
+    }
+
+    fn connected(&mut self, _client: u64) {}
+
+    /// Handles the loss of the client. The running command continues to its end, and the waiting commands are dropped.
+    fn client_lost(&mut self, _client: u64, now: Duration) {
+        self.waiting.clear();
+        self.out.clear();
+        // A command whose acknowledgement was delayed has not begun yet, so it is dropped.
+        if self.running.as_ref().is_some_and(|running| running.began > now) {
+            self.abandon(now, &DmeError::new(6, ""));
+            self.out.clear();
+        }
+        self.running.iter_mut().for_each(|running| running.client_gone = true);
+        (self.in_session, self.latched) = (false, false);
+    }
+
+    fn serves(&self, _client: u64) -> bool {
+        true
+    }
+
+    fn due(&self, _client: u64) -> Option<Duration> {
+        let running = self.running.as_ref().map(|running| running.next(self.speed));
+        running.into_iter().chain(self.out.front().map(|out| out.at)).min()
+    }
+
+    /// Handles a line from the client. An event command is carried out at once, any other command is queued. An invalid
+    /// line is answered with an error.
+    fn receive(&mut self, _client: u64, text: &str, now: Duration) {
+        match line::read(text) {
+            Err((tag, error)) => {
+                let tag = tag.unwrap_or(Tag::UNSOLICITED);
+                self.say(now, format!("{tag} &"));
+                self.fail(tag, &error, now);
+                self.say(now, format!("{tag} %"));
+            }
+            Ok((tag, command)) if tag.is_event() => self.run_event_command(tag, &command, now),
+            Ok((tag, command)) => {
+                let fault = self.faults.next_at(|name| *name == command.name);
+                if fault == Some(Fault::EmergencyStop) {
+                    return self.emergency_stop(now);
+                }
+                let late = if let Some(Fault::LateAcknowledgement(late)) = fault { late } else { Duration::ZERO };
+                let ack = Outgoing { at: now + late, text: format!("{tag} &\r\n"), split: false, closes: false };
+                self.out.push_back(ack);
+                self.waiting.push_back((tag, command.with(fault)));
+                if self.running.is_none() {
+                    self.begin_next(now + late);
+                }
+            }
+        }
+    }
+
+    fn tick(&mut self, _client: u64, now: Duration) -> Vec<Outgoing> {
+        self.advance_time(now);
+        take_due(&mut self.out, now)
+    }
+
+    /// Advances the simulation to the time `now`. The lines that become due stay queued for [`Self::tick`].
+    fn advance_time(&mut self, now: Duration) {
+        while self.running.as_ref().is_some_and(|running| running.next(self.speed) <= now) {
+            if self.say_scanned() {
+                continue;
+            }
+            self.finish();
+            self.begin_next(now);
+        }
     }
 }

@@ -26,23 +26,14 @@ use event::{ControllerEvent, Observer};
 use faults::{Fault, LineFaults};
 use program::{LogAction, Program, Step, says};
 
+use crate::line_server::{LineServer, Outgoing, take_due};
+
 /// Duration of every `set`.
 const SET_DURATION: Duration = Duration::from_millis(100);
 /// Maximum distance between two samples of the wheel along its path, in mm.
 const STEP_MM: f64 = 0.5;
 /// Position of the wheel's centre when it is away from everything.
 const AWAY_MM: Vec3 = [0.0, 0.0, 100.0];
-
-/// Line to send to a client.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Outgoing {
-    /// Time to send it, in the caller's time.
-    pub at: Duration,
-    /// Line, with its line end.
-    pub text: String,
-    /// True if the connection closes after the line.
-    pub closes: bool,
-}
 
 #[derive(Default)]
 struct Client {
@@ -213,51 +204,6 @@ impl Controller {
 
     // ---- lines --------------------------------------------------------------------------------------------------------------------
 
-    /// Registers a new client with the number `client`.
-    pub fn connected(&mut self, client: u64) {
-        self.clients.insert(client, Client::default());
-    }
-
-    /// Removes the client `client`, whose connection was lost. A running program continues.
-    pub fn client_lost(&mut self, client: u64) {
-        self.clients.remove(&client);
-    }
-
-    /// Returns true if a client is connected and has not sent `quit`.
-    pub fn serves(&self, client: u64) -> bool {
-        self.clients.contains_key(&client)
-    }
-
-    /// Returns the time of the controller's next action for the client `client`. The action is to carry out a queued
-    /// line or to send a queued answer. Returns `None` if nothing is queued, or if the client is not connected.
-    pub fn due(&self, client: u64) -> Option<Duration> {
-        let client = self.clients.get(&client)?;
-        let next = client.lines.front().map(|_| client.free_at);
-        next.into_iter().chain(client.out.front().map(|out| out.at)).min()
-    }
-
-    /// Queues a line that a client has sent, and carries out the queued lines that are due at the time `now`. `client`
-    /// is the number of the client. Ignores the line if this client is not connected.
-    pub fn receive(&mut self, client: u64, line: &str, now: Duration) {
-        if let Some(client) = self.clients.get_mut(&client) {
-            client.lines.push_back(line.trim().to_owned());
-        }
-        self.attend(client, now);
-    }
-
-    /// Advances the simulation to the time `now`, and carries out the queued lines of the client `client` that are due.
-    /// Returns the answers to this client that are due at this time. Returns an empty list if the client is not
-    /// connected.
-    pub fn tick(&mut self, client: u64, now: Duration) -> Vec<Outgoing> {
-        self.attend(client, now);
-        let Some(client) = self.clients.get_mut(&client) else { return Vec::new() };
-        let mut due = Vec::new();
-        while client.out.front().is_some_and(|out| out.at <= now) {
-            due.extend(client.out.pop_front());
-        }
-        due
-    }
-
     /// Advances the simulation to the time `now`, and carries out the queued lines of the client `number` that are due.
     fn attend(&mut self, number: u64, now: Duration) {
         self.advance_time(now);
@@ -305,7 +251,7 @@ impl Controller {
         client.free_at = now + late;
         if answer.is_some() || closes {
             let text = answer.unwrap_or_default();
-            client.out.push_back(Outgoing { at: now + late, text, closes });
+            client.out.push_back(Outgoing { at: now + late, text, split: false, closes });
         }
     }
 
@@ -487,9 +433,76 @@ impl Controller {
         }
     }
 
+    /// Moves the wheel at the speed `mm_s` along the first `goes_mm` of the straight way to `to_mm`, which is `way_mm`
+    /// long.
+    fn go(&mut self, to_mm: Vec3, [way_mm, goes_mm]: [f64; 2], mm_s: f64) {
+        let from = self.at_mm;
+        let place = |mm: f64| -> Vec3 {
+            std::array::from_fn(|k| if mm >= way_mm { to_mm[k] } else { from[k] + (to_mm[k] - from[k]) * mm / way_mm })
+        };
+        let pieces = (goes_mm / STEP_MM).ceil().max(1.0) as u32;
+        for piece in 1..=pieces {
+            let mm = goes_mm * f64::from(piece) / f64::from(pieces);
+            self.wheel.move_to(place(mm), self.clock_s + mm / mm_s);
+        }
+        (self.at_mm, self.clock_s) = (place(goes_mm), self.clock_s + goes_mm / mm_s);
+    }
+
+    fn end(&mut self) {
+        let path = self.program.as_ref().map(|program| program.path.clone()).unwrap_or_default();
+        self.wheel.release_part();
+        self.notify(ControllerEvent::Ended { path });
+        self.break_off();
+    }
+}
+
+impl LineServer for Controller {
+    const LINE_ENDS: &'static [u8] = b"\r\n";
+    const MAX_LINE_LENGTH: usize = 4096;
+    const ONE_CLIENT_AT_A_TIME: bool = false;
+
+    fn is_urgent(_line: &str) -> bool {
+        true
+    }
+
+    fn connected(&mut self, client: u64) {
+        self.clients.insert(client, Client::default());
+    }
+
+    /// Removes a client. A running program continues.
+    fn client_lost(&mut self, client: u64, _now: Duration) {
+        self.clients.remove(&client);
+    }
+
+    /// Returns true if the client is connected and has not sent `quit`.
+    fn serves(&self, client: u64) -> bool {
+        self.clients.contains_key(&client)
+    }
+
+    fn due(&self, client: u64) -> Option<Duration> {
+        let client = self.clients.get(&client)?;
+        let next = client.lines.front().map(|_| client.free_at);
+        next.into_iter().chain(client.out.front().map(|out| out.at)).min()
+    }
+
+    /// Queues a line, and carries out the queued lines that are due. Ignores an empty line, and a line of a client that
+    /// is not connected.
+    fn receive(&mut self, client: u64, line: &str, now: Duration) {
+        let line = line.trim();
+        if let Some(client) = self.clients.get_mut(&client).filter(|_| !line.is_empty()) {
+            client.lines.push_back(line.to_owned());
+        }
+        self.attend(client, now);
+    }
+
+    fn tick(&mut self, client: u64, now: Duration) -> Vec<Outgoing> {
+        self.attend(client, now);
+        self.clients.get_mut(&client).map_or_else(Vec::new, |client| take_due(&mut client.out, now))
+    }
+
     /// Advances the simulation to the time `now`. If a program runs, moves the wheel along the program for the
     /// simulated time since the previous call.
-    pub fn advance_time(&mut self, now: Duration) {
+    fn advance_time(&mut self, now: Duration) {
         let mut left_s = now.saturating_sub(self.last_time).as_secs_f64() * self.speed;
         self.last_time = now;
         self.update_motion();
@@ -530,27 +543,5 @@ impl Controller {
             }
             self.steps.pop_front();
         }
-    }
-
-    /// Moves the wheel at the speed `mm_s` along the first `goes_mm` of the straight way to `to_mm`, which is `way_mm`
-    /// long.
-    fn go(&mut self, to_mm: Vec3, [way_mm, goes_mm]: [f64; 2], mm_s: f64) {
-        let from = self.at_mm;
-        let place = |mm: f64| -> Vec3 {
-            std::array::from_fn(|k| if mm >= way_mm { to_mm[k] } else { from[k] + (to_mm[k] - from[k]) * mm / way_mm })
-        };
-        let pieces = (goes_mm / STEP_MM).ceil().max(1.0) as u32;
-        for piece in 1..=pieces {
-            let mm = goes_mm * f64::from(piece) / f64::from(pieces);
-            self.wheel.move_to(place(mm), self.clock_s + mm / mm_s);
-        }
-        (self.at_mm, self.clock_s) = (place(goes_mm), self.clock_s + goes_mm / mm_s);
-    }
-
-    fn end(&mut self) {
-        let path = self.program.as_ref().map(|program| program.path.clone()).unwrap_or_default();
-        self.wheel.release_part();
-        self.notify(ControllerEvent::Ended { path });
-        self.break_off();
     }
 }

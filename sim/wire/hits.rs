@@ -12,6 +12,7 @@ use tokio::task::JoinSet;
 use tokio::time::sleep;
 
 use super::pty::Pty;
+use super::tcp::next_client;
 use crate::hits::PartProgram;
 
 /// Interval at which a part program checks for a new list.
@@ -63,10 +64,7 @@ impl ServingHits {
         let mut tasks = JoinSet::new();
         tasks.spawn(async move {
             loop {
-                match listener.accept().await {
-                    Ok((stream, _)) => drop(print(stream, &mut inbox).await),
-                    Err(_) => sleep(LIST_POLL_INTERVAL).await,
-                }
+                drop(print(next_client(&listener).await, &mut inbox).await);
             }
         });
         Ok(Self { path: None, local_addr, lines, tasks })

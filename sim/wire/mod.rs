@@ -5,8 +5,7 @@
 //!  rtu      a serial line, real or not, that takes as long as its baud rate says
 //!  pty      a serial line without hardware, opened by its path
 //!  faults   faults on Modbus, with their conditions
-//!  dme      I++ DME over TCP, one client at a time
-//!  rsh      the lines of linuxcncrsh, any number of clients
+//!  lines    lines of text over TCP, for I++ DME and linuxcncrsh
 //!  executed the path that an external controller executes, a line for each servo cycle
 //!  hits     a line for each touch, on a serial line or over TCP
 //! ```
@@ -14,16 +13,15 @@
 //! Most callers need only [`Serving`]: it binds, serves, lets the machines' time pass, and stops.
 
 mod answer;
-pub mod dme;
 pub mod executed_path;
 pub mod faults;
 pub mod hits;
+pub mod lines;
 #[cfg(not(unix))]
 #[path = "no_pty.rs"]
 pub mod pty;
 #[cfg(unix)]
 pub mod pty;
-pub mod rsh;
 pub mod rtu;
 pub mod tcp;
 
@@ -32,7 +30,6 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use tokio::io::AsyncWrite;
 use tokio::net::{TcpListener, ToSocketAddrs};
 use tokio::task::JoinSet;
 
@@ -58,7 +55,7 @@ pub struct Serving {
     path: Option<PathBuf>,
     machines: Units,
     faults: SharedFaultPlan,
-    tasks: JoinSet<io::Result<()>>,
+    tasks: JoinSet<()>,
     /// Link to a pseudo-terminal, and its target.
     linked: Option<(PathBuf, PathBuf)>,
 }
@@ -98,7 +95,7 @@ impl Serving {
         let mut serving = Self::new(units, faults);
         serving.local_addr = Some(listener.local_addr()?);
         let (machines, faults) = (serving.machines.clone(), serving.faults.clone());
-        serving.tasks.spawn(async move { tcp::serve_tcp(listener, machines, faults).await });
+        serving.tasks.spawn(tcp::serve_tcp(listener, machines, faults));
         Ok(serving)
     }
 
@@ -116,7 +113,11 @@ impl Serving {
         let port = pty::Pty::open()?;
         let mut serving = Self::new(units, faults);
         serving.path = Some(port.path().to_path_buf());
-        serving.spawn_rtu(port, line);
+        let (machines, faults) = (serving.machines.clone(), serving.faults.clone());
+        serving.tasks.spawn(async move {
+            // A pseudo-terminal fails only when it is closed for good.
+            let _ = rtu::serve_rtu(port, machines, line, faults).await;
+        });
         Ok(serving)
     }
 
@@ -138,44 +139,12 @@ impl Serving {
         Ok(())
     }
 
-    /// Serves machines over Modbus RTU on an existing serial port of this computer, with 8 data bits, no parity and 1
-    /// stop bit. `path` is the path of the port. `units` contains each machine with its unit id. `line` contains the
-    /// baud rate, and `faults` is the fault plan.
-    ///
-    /// # Errors
-    /// Returns an error if the port cannot be opened.
-    pub fn rtu_at<M: Into<SharedMachine>>(
-        path: impl AsRef<Path>,
-        units: Vec<(u8, M)>,
-        line: rtu::Line,
-        faults: SharedFaultPlan,
-    ) -> io::Result<Self> {
-        let path = path.as_ref();
-        let builder = tokio_serial::new(path.to_string_lossy(), line.baud);
-        let port = tokio_serial::SerialStream::open(&builder)?;
-        let mut serving = Self::new(units, faults);
-        serving.path = Some(path.to_path_buf());
-        serving.spawn_rtu(port, line);
-        Ok(serving)
-    }
-
     fn new<M: Into<SharedMachine>>(units: Vec<(u8, M)>, faults: SharedFaultPlan) -> Self {
         let machines: Units = units.into_iter().map(|(unit, machine)| (unit, machine.into())).collect();
         let living = machines.iter().map(|(_, machine)| machine.clone()).collect();
         let mut tasks = JoinSet::new();
-        tasks.spawn(async move {
-            advance_machines(living).await;
-            Ok(())
-        });
+        tasks.spawn(advance_machines(living));
         Self { local_addr: None, path: None, machines, faults, tasks, linked: None }
-    }
-
-    fn spawn_rtu<P>(&mut self, port: P, line: rtu::Line)
-    where
-        P: tokio::io::AsyncRead + AsyncWrite + Unpin + Send + 'static,
-    {
-        let (machines, faults) = (self.machines.clone(), self.faults.clone());
-        self.tasks.spawn(async move { rtu::serve_rtu(port, machines, line, faults).await });
     }
 
     /// Returns the address of the TCP server, or `None` for a serial port.
@@ -203,22 +172,6 @@ impl Serving {
     /// [`SharedFaultPlan::set`].
     pub fn faults(&self) -> &SharedFaultPlan {
         &self.faults
-    }
-
-    /// Waits until the simulated interface fails, for example because a serial port is unplugged, and returns the
-    /// failure as an error. Does not return while the interface works. A TCP port does not fail.
-    ///
-    /// # Errors
-    /// Returns the failure of the interface.
-    pub async fn failed(&mut self) -> io::Result<()> {
-        loop {
-            match self.tasks.join_next().await {
-                Some(Ok(Err(error))) => return Err(error),
-                Some(Err(error)) => return Err(io::Error::other(error)),
-                Some(Ok(Ok(()))) => {}
-                None => return Ok(()),
-            }
-        }
     }
 
     /// Closes every connection and waits until all tasks have ended. The machines keep their state and can be served

@@ -4,34 +4,38 @@ use std::io;
 use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
 
 use super::answer::{After, Framing, Units, answer};
 use super::faults::SharedFaultPlan;
 
+/// Time between two attempts to accept a client.
+const ACCEPT_AGAIN: Duration = Duration::from_millis(20);
+
+/// Waits for the next client that connects to `listener`, and returns its stream.
+pub(super) async fn next_client(listener: &TcpListener) -> TcpStream {
+    loop {
+        match listener.accept().await {
+            Ok((stream, _)) if stream.set_nodelay(true).is_ok() => return stream,
+            Ok(_) => {}
+            // The process has no descriptors left, or a client was gone at once: neither concerns the other clients.
+            Err(_) => tokio::time::sleep(ACCEPT_AGAIN).await,
+        }
+    }
+}
+
 /// Answers Modbus TCP requests of any number of clients that connect to `listener`. `units` are the simulated machines
 /// with their unit ids. `faults` are the simulated faults. Runs until its future is dropped. All connections are then
 /// closed.
-///
-/// # Errors
-/// Never. The return type is the same as that of `serve_rtu`, the function for a serial line.
-pub async fn serve_tcp(listener: TcpListener, units: Units, faults: SharedFaultPlan) -> io::Result<()> {
+pub async fn serve_tcp(listener: TcpListener, units: Units, faults: SharedFaultPlan) {
     let mut clients = JoinSet::new();
     loop {
         tokio::select! {
-            accepted = listener.accept() => match accepted {
-                Ok((stream, _)) => {
-                    let (units, faults) = (units.clone(), faults.clone());
-                    clients.spawn(async move {
-                        stream.set_nodelay(true)?;
-                        serve_client(stream, &units, &faults).await
-                    });
-                }
-                // The process has no descriptors left, or a client was gone at once: neither concerns the other
-                // clients.
-                Err(_) => tokio::time::sleep(Duration::from_millis(20)).await,
-            },
+            stream = next_client(&listener) => {
+                let (units, faults) = (units.clone(), faults.clone());
+                clients.spawn(async move { serve_client(stream, &units, &faults).await });
+            }
             Some(_) = clients.join_next() => {}
         }
     }

@@ -19,10 +19,10 @@ use regrind_sim::program::Control;
 use regrind_sim::register_encoding;
 use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::spec::WorldSpec;
-use regrind_sim::wire::dme::ServingDme;
 use regrind_sim::wire::executed_path::ExecutedPath;
 use regrind_sim::wire::faults::SharedFaultPlan;
 use regrind_sim::wire::hits::ServingHits;
+use regrind_sim::wire::lines::ServingLines;
 use regrind_sim::wire::rtu;
 use regrind_sim::wire::{Serving, SharedMachine};
 use regrind_sim::world::World;
@@ -38,7 +38,7 @@ pub(super) struct SimulatedCell {
     /// Address of each machine, in words.
     pub(super) places: Vec<String>,
     /// Measuring machine with an I++ DME server.
-    dme: Option<ServingDme>,
+    dme: Option<ServingLines<dme::Server>>,
     /// Measuring machine that prints its hits, and the folder for its list if the cell file names none.
     hits: Option<(ServingHits, Option<ScratchFolder>)>,
     /// Paths of the links to pseudo-terminals, which take the place of the serial devices.
@@ -244,7 +244,7 @@ impl SimulatedCell {
         let machine = dme::machine::DmeMachine::new(probe, dme::machine::Options { tools, ..Default::default() });
         let server = dme::Server::new(machine, speed, dme::faults::CommandFaults::none());
         let (host, port) = (wire.host.clone(), wire.port);
-        let serving = ServingDme::tcp_after((host.as_str(), port), server, grinder).await.map_err(|e| {
+        let serving = ServingLines::tcp_after((host.as_str(), port), server, grinder).await.map_err(|e| {
             format!("the simulated machine cannot use the address {host}:{port}: {e}; choose another port, or end the program that uses this port")
         })?;
         wire.port = serving.local_addr().port();

@@ -15,8 +15,7 @@ use regrind_sim::rsh::event::ControllerEvent;
 use regrind_sim::rsh::faults::LineFaults as RshFaults;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::SharedMachine;
-use regrind_sim::wire::dme::SharedServer;
-use regrind_sim::wire::rsh::SharedController;
+use regrind_sim::wire::lines::SharedLineServer;
 use regrind_sim::world::World;
 use serde::Deserialize;
 use tokio::time::Instant;
@@ -54,8 +53,8 @@ const OF_PROGRAMS: f64 = 0.25;
 #[derive(Clone)]
 pub enum Plant {
     Registers(SharedMachine),
-    Dme(SharedServer),
-    Rsh(SharedController),
+    Dme(SharedLineServer<Server>),
+    Rsh(SharedLineServer<Controller>),
 }
 
 impl Plant {
@@ -97,10 +96,7 @@ impl Plant {
     fn live(&self) {
         match self {
             Self::Registers(machine) => machine.with(|machine| machine.tick(TICK)),
-            Self::Dme(server) => {
-                let now = server.now();
-                server.with(|server| server.advance_time(now));
-            }
+            Self::Dme(server) => server.advance_time(),
             Self::Rsh(controller) => controller.advance_time(),
         }
     }
@@ -192,7 +188,7 @@ fn by_lines(
     speed: f64,
     faults: DmeFaults,
     (log, machine_events, cues): (&Log, &Deeds, &Cues),
-) -> SharedServer {
+) -> SharedLineServer<Server> {
     let mut server = Server::new(probe::DmeMachine::new(world.touch_probe(), probe::Options::default()), speed, faults);
     let (log, machine_events, cues) = (log.clone(), machine_events.clone(), cues.clone());
     server.set_observer(Box::new(move |event| {
@@ -210,7 +206,7 @@ fn by_lines(
         };
         log.lock().unwrap().push(Moment { at, machine: 0, what: HandshakeEvent::Changed { from, to } });
     }));
-    SharedServer::from(server)
+    server.into()
 }
 
 /// Returns a grinder with linuxcncrsh.
@@ -219,7 +215,7 @@ fn by_programs(
     speed: f64,
     faults: RshFaults,
     (log, machine_events, cues): (&Log, &RshDeeds, &Cues),
-) -> SharedController {
+) -> SharedLineServer<Controller> {
     let radius_mm = setting(RequiredQuality::Good).recipe.grinding.wheel.radius_mm();
     let mut controller = Controller::new(world.wheel(radius_mm).unwrap(), speed, faults);
     let (log, machine_events, cues) = (log.clone(), machine_events.clone(), cues.clone());
@@ -234,7 +230,7 @@ fn by_programs(
         };
         log.lock().unwrap().push(Moment { at, machine: 1, what: HandshakeEvent::Changed { from, to } });
     }));
-    SharedController::from(controller)
+    controller.into()
 }
 
 /// Returns true if a machine in this state is possibly moving.

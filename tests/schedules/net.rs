@@ -12,10 +12,11 @@ use std::time::Duration;
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
 use regrind::device::{ConnectFuture, Connector, LineAddress, LineStream};
+use regrind_sim::dme::Server;
+use regrind_sim::rsh::Controller;
 use regrind_sim::wire::Units;
-use regrind_sim::wire::dme::SharedServer;
 use regrind_sim::wire::faults::SharedFaultPlan;
-use regrind_sim::wire::rsh::SharedController;
+use regrind_sim::wire::lines::SharedLineServer;
 use regrind_sim::wire::rtu::{Line as Pace, serve_rtu};
 use regrind_sim::wire::tcp::serve_client;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, DuplexStream, ReadBuf, duplex, split};
@@ -50,8 +51,8 @@ const AGAIN: Duration = Duration::from_millis(20);
 #[derive(Clone)]
 pub enum Far {
     Registers(Units),
-    Dme(SharedServer),
-    Rsh(SharedController),
+    Dme(SharedLineServer<Server>),
+    Rsh(SharedLineServer<Controller>),
 }
 
 /// Network to one machine, or to both on one line.

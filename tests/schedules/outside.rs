@@ -7,13 +7,13 @@ use std::time::Duration;
 use regrind::device::{Link, Machine as _, ModbusCmm, ModbusGrinder, ModbusSettings};
 use regrind::drive::{OrderSender, Request};
 use regrind_sim::command::{CommandFrame, Mode};
+use regrind_sim::dme::Server;
 use regrind_sim::options::RegisterLayout;
 use regrind_sim::register_encoding::WordOrder;
 use regrind_sim::rsh::Controller;
 use regrind_sim::wire::SharedMachine;
-use regrind_sim::wire::dme::SharedServer;
 use regrind_sim::wire::faults::{Fault, FaultPlan, SharedFaultPlan, When};
-use regrind_sim::wire::rsh::SharedController;
+use regrind_sim::wire::lines::SharedLineServer;
 use tokio::time::{Instant, sleep};
 
 use crate::ledger::{Disk, SharedDisk};
@@ -135,7 +135,7 @@ impl Outside {
     }
 
     /// Performs an act on a server of I++ DME: a restart. It ignores all others.
-    async fn at_dme(&self, act: &Act, server: &SharedServer) {
+    async fn at_dme(&self, act: &Act, server: &SharedLineServer<Server>) {
         if let Act::Reboot { .. } = act {
             let now = server.now();
             server.with(|server| server.restart(now));
@@ -145,7 +145,7 @@ impl Outside {
     }
 
     /// Performs an act on a controller of programs, or an act of people at it.
-    async fn at_rsh(&self, act: &Act, controller: &SharedController) {
+    async fn at_rsh(&self, act: &Act, controller: &SharedLineServer<Controller>) {
         match act {
             Act::Reboot { .. } => {
                 controller.with(Controller::kill);

@@ -12,7 +12,7 @@ use regrind_sim::dme::Server;
 use regrind_sim::dme::faults::CommandFaults;
 use regrind_sim::dme::machine::{self, Options};
 use regrind_sim::spec::{CmmSpec, WorldSpec};
-use regrind_sim::wire::dme::ServingDme;
+use regrind_sim::wire::lines::ServingLines;
 use regrind_sim::world::World;
 
 pub const RADIUS_MM: f64 = 1.5;
@@ -23,7 +23,7 @@ const LONG: Duration = Duration::from_secs(60);
 pub struct Bench {
     pub world: World,
     pub faults: CommandFaults,
-    pub serving: ServingDme,
+    pub serving: ServingLines<Server>,
     pub cmm: IppdmeCmm,
 }
 
@@ -76,7 +76,7 @@ impl Bench {
         let world = World::new(WorldSpec { cmm, ..WorldSpec::default() }).unwrap();
         let faults = CommandFaults::none();
         let server = Server::new(machine::DmeMachine::new(world.touch_probe(), options), speed, faults.clone());
-        let serving = ServingDme::tcp("127.0.0.1:0", server).await.unwrap();
+        let serving = ServingLines::tcp("127.0.0.1:0", server).await.unwrap();
         let cmm = IppdmeCmm::new(settings(serving.local_addr().port(), limits));
         Self { world, faults, serving, cmm }
     }

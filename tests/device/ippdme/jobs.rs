@@ -4,8 +4,9 @@ use regrind::device::{
     CarefulStart, Cmm, DeviceError, Interrupt, IppdmeCmm, Machine, MachineState, Outcome, Plan, Reconciled, TouchStatus,
 };
 use regrind_sim::dme::machine::Options;
+use regrind_sim::line_server::LineServer;
 use regrind_sim::spec::CmmSpec;
-use regrind_sim::wire::dme::ServingDme;
+use regrind_sim::wire::lines::ServingLines;
 
 use super::bench::{Bench, begin, has_state, job, patient, settings, until, until_points, until_still};
 
@@ -107,7 +108,7 @@ async fn abort_then_clear_allows_prepare() {
     let status = until_still(&mut bench.cmm).await.unwrap();
     assert_eq!((status.state, status.outcome, status.clear_of_part), (MachineState::Aborted, Outcome::Aborted, None));
     // Nothing of the job remains at the server.
-    assert_eq!(bench.serving.with(|server| server.due()), None);
+    assert_eq!(bench.serving.with(|server| server.due(1)), None);
     assert_eq!(bench.cmm.clear().await.unwrap().state, MachineState::Idle);
     bench.cmm.prepare(job(&plan)).await.unwrap();
 }
@@ -211,7 +212,7 @@ async fn second_client_connects_after_release() {
     let mut other = bench.another();
     let (first, second) = tokio::join!(bench.cmm.release(), other.connect());
     assert!(first.is_ok() && second.is_ok(), "{first:?}, {second:?}");
-    let _: &ServingDme = &bench.serving;
+    let _: &ServingLines<regrind_sim::dme::Server> = &bench.serving;
 }
 
 #[tokio::test]

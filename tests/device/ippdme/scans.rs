@@ -6,6 +6,7 @@ use regrind::device::{
 };
 use regrind_sim::dme::faults::Fault;
 use regrind_sim::dme::machine::Options;
+use regrind_sim::line_server::LineServer;
 use regrind_sim::spec::CmmSpec;
 
 use super::bench::{Bench, job, patient, settings, until, until_still};
@@ -141,7 +142,7 @@ async fn hold_in_scan_defers_next_row() {
     assert_eq!(bench.cmm.hold().await.unwrap().state, MachineState::Holding);
     let held = until_still(&mut bench.cmm).await.unwrap();
     assert_eq!((held.state, held.progress, held.clear_of_part), (MachineState::Held, Some((24, 37)), Some(true)));
-    assert_eq!(bench.serving.with(|server| (server.due(), server.machine().contacts())), (None, 2));
+    assert_eq!(bench.serving.with(|server| (server.due(1), server.machine().contacts())), (None, 2));
     bench.cmm.resume().await.unwrap();
     let ended = until_still(&mut bench.cmm).await;
     assert_measured(&mut bench, ended).await;
@@ -156,7 +157,7 @@ async fn abort_in_scan_ends_row() {
     assert_eq!((status.state, status.outcome, status.clear_of_part), (MachineState::Aborted, Outcome::Aborted, None));
     // The row that was finished before is present, and nothing of this one. Nothing of this one remains at the server.
     assert_eq!(status.progress, Some((12, 37)));
-    let left = bench.serving.with(|server| (server.due(), server.machine().contacts()));
+    let left = bench.serving.with(|server| (server.due(1), server.machine().contacts()));
     assert_eq!(left, (None, 2));
 }
 
