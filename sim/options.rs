@@ -3,10 +3,12 @@
 
 use std::time::Duration;
 
+use serde::Deserialize;
+
 use crate::register_encoding::WordOrder;
 
 /// First address of every block.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[allow(missing_docs)]
 pub struct RegisterLayout {
     pub identity: u16,

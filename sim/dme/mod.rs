@@ -7,6 +7,7 @@
 //!  scan     scans: curves followed in contact
 //!  faults   faults, by command
 //!  event    events of the machine
+//!  simulator  the machine of a simulated cell
 //! ```
 //!
 //! Commands are acknowledged when they arrive and carried out one after another; those whose name ends in E are carried
@@ -18,6 +19,7 @@ pub mod faults;
 pub mod line;
 pub mod machine;
 mod scan;
+pub(crate) mod simulator;
 
 use std::collections::VecDeque;
 use std::time::Duration;

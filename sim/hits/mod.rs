@@ -5,6 +5,7 @@
 //!  list     list of targets, implemented independently
 //!  print    format of a touch, eight of them
 //!  faults   faults, by line
+//!  simulator  the machine of a simulated cell
 //! ```
 //!
 //! This module contains no wire; `wire/hits` has one.
@@ -12,6 +13,7 @@
 pub mod faults;
 pub mod list;
 pub mod print;
+pub(crate) mod simulator;
 
 use std::time::Duration;
 

@@ -5,6 +5,7 @@
 //!  program  a program as the interpreter reads it: ahead of the motion
 //!  faults   faults, by line
 //!  event     events of the controller
+//!  simulator  the grinder of a simulated cell
 //! ```
 //!
 //! The acknowledgement of a `set` means only that the line was received. Whether it succeeded follows from the errors,
@@ -14,6 +15,7 @@
 pub mod event;
 pub mod faults;
 mod program;
+pub(crate) mod simulator;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::OpenOptions;
@@ -56,6 +58,8 @@ enum Interpreter {
 /// Controller, and the machine that it moves.
 pub struct Controller {
     wheel: Wheel,
+    /// Passwords of `hello` and of `set enable`.
+    passwords: [String; 2],
     faults: LineFaults,
     /// Seconds of the machine's time in a real second.
     speed: f64,
@@ -89,6 +93,7 @@ impl Controller {
     pub fn new(wheel: Wheel, speed: f64, faults: LineFaults) -> Self {
         Self {
             wheel,
+            passwords: ["EMC", "EMCTOO"].map(str::to_owned),
             faults,
             speed,
             clients: BTreeMap::new(),
@@ -110,6 +115,11 @@ impl Controller {
             moving: false,
             observer: None,
         }
+    }
+
+    /// Sets the passwords of `hello`, with which a client connects, and of `set enable`, with which it takes control.
+    pub fn set_passwords(&mut self, passwords: [String; 2]) {
+        self.passwords = passwords;
     }
 
     /// Sets an observer, which receives all events of the controller from now on.
@@ -266,7 +276,7 @@ impl Controller {
         match first.as_str() {
             "hello" => {
                 let client = self.clients.get_mut(&number)?;
-                client.greeted = second == "emc";
+                client.greeted = second.eq_ignore_ascii_case(&self.passwords[0]);
                 Some(if client.greeted { "HELLO ACK EMCNETSVR 1.1\r\n" } else { "HELLO NAK\r\n" }.to_owned())
             }
             "get" => Some(match self.query(number, &second) {
@@ -325,7 +335,7 @@ impl Controller {
             ("echo", off) => client.quiet = off == "off",
             ("verbose", on) => client.verbose = on == "on",
             ("enable", "off") => self.owner = self.owner.filter(|owner| *owner != number),
-            ("enable", _) if rest != "EMCTOO" => return Some(false),
+            ("enable", _) if rest != self.passwords[1] => return Some(false),
             ("enable", _) => self.owner = Some(number),
             _ if self.owner != Some(number) => return None,
             _ if self.stopped || !self.on => return Some(false),

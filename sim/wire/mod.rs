@@ -24,6 +24,7 @@ pub mod pty;
 pub mod pty;
 pub mod rtu;
 pub mod tcp;
+pub mod terminal_link;
 
 use std::io;
 use std::net::SocketAddr;
@@ -35,6 +36,7 @@ use tokio::task::JoinSet;
 
 pub use answer::{SharedMachine, Units};
 use faults::SharedFaultPlan;
+use terminal_link::TerminalLink;
 
 /// Interval at which the machines' time advances.
 const TICK: Duration = Duration::from_millis(10);
@@ -56,19 +58,7 @@ pub struct Serving {
     machines: Units,
     faults: SharedFaultPlan,
     tasks: JoinSet<()>,
-    /// Link to a pseudo-terminal, and its target.
-    linked: Option<(PathBuf, PathBuf)>,
-}
-
-impl Drop for Serving {
-    fn drop(&mut self) {
-        if let Some((link, port)) = self.linked.take()
-            && std::fs::read_link(&link).is_ok_and(|to| to == port)
-        {
-            // There is nobody to report an error to; the next simulator replaces a link that stays.
-            let _ = std::fs::remove_file(link);
-        }
-    }
+    link: Option<TerminalLink>,
 }
 
 impl Serving {
@@ -121,21 +111,15 @@ impl Serving {
         Ok(serving)
     }
 
-    /// Creates a symbolic link at the path `at` to the served serial port. The configuration of a client can then
+    /// Creates a symbolic link at the path `at` to the served pseudo-terminal. The configuration of a client can then
     /// contain a fixed path. Replaces an existing link at `at`. The link is removed when this value is dropped.
     ///
     /// # Errors
-    /// Returns an error if `at` is an existing file that is not a link, if the link cannot be created, or if the
-    /// machines are served over TCP.
-    pub fn link(&mut self, at: impl AsRef<Path>) -> io::Result<()> {
+    /// Returns the reason as text if `at` is an existing file that is not a link, or if the link cannot be created.
+    pub fn link(&mut self, at: impl AsRef<Path>) -> Result<(), String> {
         let at = at.as_ref();
-        let port = self.path.clone().ok_or(io::ErrorKind::Unsupported)?;
-        if std::fs::symlink_metadata(at).is_ok_and(|found| found.is_symlink()) {
-            std::fs::remove_file(at)?;
-        }
-        pty::link(&port, at)?;
-        self.linked = Some((at.to_path_buf(), port));
-        self.path = Some(at.to_path_buf());
+        let terminal = self.path.replace(at.to_path_buf()).unwrap_or_default();
+        self.link = Some(TerminalLink::place(&terminal, at)?);
         Ok(())
     }
 
@@ -144,7 +128,7 @@ impl Serving {
         let living = machines.iter().map(|(_, machine)| machine.clone()).collect();
         let mut tasks = JoinSet::new();
         tasks.spawn(advance_machines(living));
-        Self { local_addr: None, path: None, machines, faults, tasks, linked: None }
+        Self { local_addr: None, path: None, machines, faults, tasks, link: None }
     }
 
     /// Returns the address of the TCP server, or `None` for a serial port.

@@ -7,7 +7,8 @@ use clap::Args;
 use regrind::cell::Device;
 use regrind::config::{BUILT_IN_CELL, CellConfig, LinkConfig};
 use regrind::device::{
-    DeviceError, DriverError, LineAddress, Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Status,
+    ConnectionCheck, DeviceError, DriverError, LineAddress, Machine, MachineKind, ModbusCmm, ModbusGrinder,
+    ModbusSettings, Status,
 };
 use regrind::drive::recovery::{describe_status, read_status};
 use regrind::formats::{ResultFolder, try_writing};
@@ -214,14 +215,14 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
     let settings = |link| setup::modbus_settings(link, cell.simulated, 1, 1);
     let [cmm, grinder] = [&cell.cmm.link, &cell.grinder.link];
     vec![
-        match cmm.wire.ippdme_address() {
-            Some(_) => server(MachineKind::Cmm, cmm, setup::create_cmm(cell)).await,
-            None if cmm.wire.hit_source().is_some() => heard(cmm, setup::create_cmm(cell)).await,
-            None => machine(Device::Cmm, cell, settings(cmm), ModbusCmm::new).await,
+        match cmm.wire.connection_check() {
+            ConnectionCheck::Session => server(MachineKind::Cmm, cmm, setup::create_cmm(cell)).await,
+            ConnectionCheck::Listen => heard(cmm, setup::create_cmm(cell)).await,
+            _ => machine(Device::Cmm, cell, settings(cmm), ModbusCmm::new).await,
         },
-        match grinder.wire.linuxcncrsh_address() {
-            Some(_) => server(MachineKind::Grinder, grinder, setup::create_grinder(cell)).await,
-            None => machine(Device::Grinder, cell, settings(grinder), ModbusGrinder::new).await,
+        match grinder.wire.connection_check() {
+            ConnectionCheck::Session => server(MachineKind::Grinder, grinder, setup::create_grinder(cell)).await,
+            _ => machine(Device::Grinder, cell, settings(grinder), ModbusGrinder::new).await,
         },
     ]
 }

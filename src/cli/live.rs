@@ -206,14 +206,7 @@ async fn heed_endings(mut endings: Endings, orders: OrderSender, actor: Actor) {
 /// another run has the lock.
 pub(super) fn lock_machine(link: &LinkConfig, kind: MachineKind, run: &Path) -> Result<Option<MachineLock>, Failure> {
     let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
-    let on_line = link.wire.modbus_line().map(|(line, unit)| format!("{kind} at {line}, unit {unit}"));
-    let served = link
-        .wire
-        .ippdme_address()
-        .or(link.wire.linuxcncrsh_address())
-        .map(|(host, port)| format!("{kind} at {host}:{port}"));
-    let heard = link.wire.hit_source().map(|line| format!("{kind} at {line}"));
-    let taken = on_line.or(served).or(heard).map(|machine| MachineLock::acquire(&machine, &run));
+    let taken = link.wire.address().map(|address| MachineLock::acquire(&format!("{kind} at {address}"), &run));
     let taken = taken.transpose().map_err(Failure::Machine)?;
     for note in taken.iter().flat_map(MachineLock::notes) {
         eprintln!("lock: {}", regrind::document::visible(note));

@@ -119,16 +119,7 @@ impl Recovery {
         machine: fn(ModbusSettings) -> io::Result<M>,
     ) -> Result<bool, Failure> {
         let Some(settings) = settings else {
-            let words = match (link.wire.ippdme_address(), link.wire.linuxcncrsh_address()) {
-                (Some(_), _) => {
-                    "the server of this machine stores no job, so there is no job to end; check that the probe is clear of the part"
-                }
-                (_, Some(_)) => {
-                    "the controller of this machine stores no job; if a program runs or is paused, end this program at the machine"
-                }
-                _ => "this machine has no data connection; bring the machine to idle by hand",
-            };
-            super::print(&format!("{device}: {words}\n"))?;
+            super::print(&format!("{device}: {}\n", link.wire.end_of_job()))?;
             return Ok(false);
         };
         let mut machine = machine(settings).map_err(|source| Failure::Port { device, source })?;

@@ -8,7 +8,6 @@ use std::time::SystemTime;
 use clap::Args;
 use regrind::cell::{Actor, CellPlan, Ending, FirstStep, TABLE_VERSION};
 use regrind::config::{BUILT_IN_CELL, CellConfig, LinkConfig};
-use regrind::device::{LineAddress, Wire};
 use regrind::drive::Task;
 use regrind::formats::{KnowledgeOrigin, LEARNED, Learned, LearnedError, SettingIdentity};
 use regrind::journal::{AuditKey, Header, Journal, free_bytes, utc_to_the_second};
@@ -291,12 +290,7 @@ fn others_in_words(others: &KnowledgeOrigin) -> String {
 /// Returns true if a machine of the cell is simulated inside this process. This is the case if the cell is simulated
 /// and the cell file leaves the address of a machine undefined, for example with port 0. Otherwise returns false.
 pub(super) fn within(cell: &CellConfig) -> bool {
-    let open = |link: &LinkConfig| {
-        matches!(link.wire.modbus_line(), Some((LineAddress::Tcp { port: 0, .. }, _)))
-            || matches!(link.wire.ippdme_address(), Some((_, 0)))
-            || matches!(&link.wire, Wire::HitLines(wire) if wire.has_dynamic_address())
-    };
-    cell.simulated && (open(&cell.cmm.link) || open(&cell.grinder.link))
+    cell.simulated && [&cell.cmm.link, &cell.grinder.link].iter().any(|link| link.wire.has_open_address())
 }
 
 /// Returns the first entry of the record of a run. The entry contains the data that a program needs to resume the run,

@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use regrind::config::{CellConfig, LinkConfig};
-use regrind::device::{HitSource, LineAddress};
+use regrind::config::CellConfig;
 use regrind::recipe::Recipe;
-use serde_json::{Value, json};
+use regrind_sim::body::Kind;
+use serde_json::json;
 
 use super::check::or_show;
 use super::failure::Failure;
@@ -49,12 +49,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         let serving = simulated::serve(spec, &mut cell, &recipe).await?;
         arguments.log.as_deref().map_or(Ok(()), |log| serving.log_to(log))?;
         if arguments.json {
-            let wires = json!({ "simulation": true, "cmm": wire(&cell.cmm.link), "grinder": wire(&cell.grinder.link) });
+            let [cmm, grinder] = [Kind::Cmm, Kind::Grinder].map(|kind| serving.address(kind));
+            let wires = json!({ "simulation": true, "cmm": cmm, "grinder": grinder });
             super::print(&format!("{wires}\n"))?;
             return until_stopped().await;
         }
         super::print(&format!("SIMULATION: the part of {}\n", recipe.path().display()))?;
-        for place in &serving.places {
+        for place in serving.places() {
             super::print(&format!("SIMULATION: {place}\n"))?;
         }
         super::print("Ctrl-C ends it.\n")?;
@@ -65,22 +66,4 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 async fn until_stopped() -> Result<Outcome, Failure> {
     tokio::signal::ctrl_c().await.map_err(Failure::Terminal)?;
     Ok(Outcome::Accepted)
-}
-
-/// Returns the address of a simulated machine as a JSON object: host and port, or serial device. `link` contains the
-/// assigned port if the cell file left the port open (0). Returns null if the machine has no address.
-fn wire(link: &LinkConfig) -> Value {
-    match link.wire.modbus_line() {
-        Some((LineAddress::Tcp { host, port }, unit)) => json!({ "host": host, "port": port, "unit": unit }),
-        Some((LineAddress::Rtu { device, baud, .. }, unit)) => json!({ "device": device, "baud": baud, "unit": unit }),
-        None => match (link.wire.ippdme_address(), link.wire.hit_source(), link.wire.linuxcncrsh_address()) {
-            (Some((host, port)), ..) => json!({ "host": host, "port": port, "kind": "ippdme" }),
-            (None, Some(HitSource::Tcp { host, port }), _) => {
-                json!({ "host": host, "port": port, "kind": "hit-lines" })
-            }
-            (None, Some(HitSource::Serial { device, .. }), _) => json!({ "device": device, "kind": "hit-lines" }),
-            (None, None, Some((host, port))) => json!({ "host": host, "port": port, "kind": "linuxcnc" }),
-            (None, None, None) => Value::Null,
-        },
-    }
 }

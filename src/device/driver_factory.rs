@@ -6,7 +6,6 @@ use std::time::Duration;
 use thiserror::Error;
 
 use super::handshake::MachineKind;
-use super::hit_lines::HitSource;
 use super::machine::{Cmm, Grinder};
 use super::machine_table::MachineTable;
 use super::modbus::{LineAddress, Link, RegisterMap, Signal};
@@ -66,6 +65,20 @@ pub struct DriverContext<'a> {
     pub shared_link: Option<&'a Link>,
 }
 
+/// Check of the connection to a machine that a program can make without a job.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ConnectionCheck {
+    /// The driver requests the identity and the status, and closes the connection.
+    Session,
+    /// The driver listens for lines of text that the machine sends by itself.
+    Listen,
+    /// The machine is a Modbus device, to which the tables `registers` and `signals` apply. Its blocks of registers are
+    /// read one by one.
+    Registers,
+    /// There is no data connection.
+    Nothing,
+}
+
 /// Table `wire` of a cell file, with the driver that belongs to it.
 pub trait DriverFactory {
     /// Measuring machine on this wire.
@@ -78,11 +91,13 @@ pub trait DriverFactory {
     const BY_PERSON: bool = false;
     /// True if its results may contain their temperature.
     const REPORTS_TEMPERATURE: bool = true;
-    /// True if the tables `registers` and `signals` apply to it.
-    const HAS_REGISTERS: bool = false;
     /// True if the grinder works from the program and the map in the folder of the run, also for the first pass of a
     /// run.
     const READS_RUN_FOLDER: bool = false;
+    /// Check of the connection without a job.
+    const CHECK: ConnectionCheck = ConnectionCheck::Nothing;
+    /// Advice for a person who must end a job of the machine, if no program can do that.
+    const END_OF_JOB: &'static str = "this machine has no data connection; bring the machine to idle by hand";
 
     /// Checks this table `wire` of the cell file, which describes the connection to one machine. Reports each error
     /// that the schema of the cell file does not detect. The errors are added to the list of problems in `_document`,
@@ -130,22 +145,16 @@ pub trait DriverFactory {
         None
     }
 
-    /// Returns the host and the TCP port of the I++ DME server of the machine. Returns `None` if the connection does
-    /// not use I++ DME.
-    fn ippdme_address(&self) -> Option<(String, u16)> {
+    /// Returns the address of the machine in words, by which this computer tells it from all other machines. Returns
+    /// `None` if the connection has no address, for example because a person operates the machine.
+    fn address(&self) -> Option<String> {
         None
     }
 
-    /// Returns the source of the hit lines: a serial port or a terminal server. A hit line is the line of text that a
-    /// measuring machine prints for each touch. Returns `None` if the connection does not use hit lines.
-    fn hit_source(&self) -> Option<HitSource> {
-        None
-    }
-
-    /// Returns the host and the TCP port of linuxcncrsh, the server of a LinuxCNC control. Returns `None` if the
-    /// connection does not use this server.
-    fn linuxcncrsh_address(&self) -> Option<(String, u16)> {
-        None
+    /// Returns true if the address of the machine is assigned only when a simulated machine starts, for example with
+    /// port 0.
+    fn has_open_address(&self) -> bool {
+        false
     }
 
     /// Returns the address of the Modbus line and the unit id of the machine on this line. The address is a host and a

@@ -1,11 +1,11 @@
 //! Table of the drivers, one line each: the name in a cell file, and the folder that owns the rest.
 
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
-use super::driver_factory::{DriverContext, DriverError, DriverFactory};
+use super::driver_factory::{ConnectionCheck, DriverContext, DriverError, DriverFactory};
 use super::file_exchange::ExchangeWire;
-use super::hit_lines::{HitLinesWire, HitSource};
+use super::hit_lines::HitLinesWire;
 use super::ippdme::IppdmeWire;
 use super::linuxcnc::LinuxcncWire;
 use super::machine::{Cmm, Grinder, Interrupt, Machine};
@@ -22,7 +22,7 @@ use regrind_formats::result::Coordinates;
 macro_rules! drivers {
     ($($(#[$doc:meta])* $wire:ident($table:ty)),+ $(,)?) => {
         /// The wire to a machine.
-        #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
         #[serde(tag = "kind", rename_all = "kebab-case")]
         pub enum Wire {
             $($(#[$doc])* $wire($table)),+
@@ -83,7 +83,7 @@ macro_rules! drivers {
             /// Returns true if the tables `registers` and `signals` of a cell file apply to this wire (the connection
             /// to one machine). This is so for Modbus.
             pub fn has_registers(&self) -> bool {
-                match self { $(Self::$wire(_) => <$table>::HAS_REGISTERS),+ }
+                self.connection_check() == ConnectionCheck::Registers
             }
 
             /// Returns true if a grinder on this wire (the connection to one machine) reads its program and its
@@ -106,22 +106,27 @@ macro_rules! drivers {
                 match self { $(Self::$wire(wire) => DriverFactory::modbus_line(wire)),+ }
             }
 
-            /// Returns the host and the TCP port of the I++ DME server of the machine. Returns `None` if this wire does
-            /// not use I++ DME.
-            pub fn ippdme_address(&self) -> Option<(String, u16)> {
-                match self { $(Self::$wire(wire) => DriverFactory::ippdme_address(wire)),+ }
+            /// Returns the address of the machine in words, by which this computer tells it from all other machines.
+            /// Returns `None` if this wire (the connection to one machine) has no address.
+            pub fn address(&self) -> Option<String> {
+                match self { $(Self::$wire(wire) => DriverFactory::address(wire)),+ }
             }
 
-            /// Returns the source of the hit lines: a serial port or a terminal server. A hit line is the line of text
-            /// that a measuring machine prints for each touch. Returns `None` if this wire does not use hit lines.
-            pub fn hit_source(&self) -> Option<HitSource> {
-                match self { $(Self::$wire(wire) => DriverFactory::hit_source(wire)),+ }
+            /// Returns true if the address of the machine is assigned only when a simulated machine starts, for example
+            /// with port 0.
+            pub fn has_open_address(&self) -> bool {
+                match self { $(Self::$wire(wire) => DriverFactory::has_open_address(wire)),+ }
             }
 
-            /// Returns the host and the TCP port of linuxcncrsh, the server of a LinuxCNC control. Returns `None` if
-            /// this wire does not use this server.
-            pub fn linuxcncrsh_address(&self) -> Option<(String, u16)> {
-                match self { $(Self::$wire(wire) => DriverFactory::linuxcncrsh_address(wire)),+ }
+            /// Returns the check of this wire (the connection to one machine) that a program can make without a job.
+            pub fn connection_check(&self) -> ConnectionCheck {
+                match self { $(Self::$wire(_) => <$table>::CHECK),+ }
+            }
+
+            /// Returns advice for a person who must end a job of the machine, if no program can do that on this wire
+            /// (the connection to one machine).
+            pub fn end_of_job(&self) -> &'static str {
+                match self { $(Self::$wire(_) => <$table>::END_OF_JOB),+ }
             }
 
             /// Creates the driver of a measuring machine on this wire. `context` contains the other data of the cell
@@ -181,6 +186,23 @@ macro_rules! drivers {
             }
         }
     };
+}
+
+impl Wire {
+    /// Replaces keys of this table (the connection to one machine), for example the port that a simulated machine has
+    /// chosen.
+    ///
+    /// # Errors
+    /// Returns an error if the table has no such key, or if a value is not valid for its key. The table is then
+    /// unchanged.
+    pub fn set_keys(&mut self, keys: serde_json::Map<String, serde_json::Value>) -> serde_json::Result<()> {
+        let mut table = serde_json::to_value(&*self)?;
+        if let Some(table) = table.as_object_mut() {
+            table.extend(keys);
+        }
+        *self = serde_json::from_value(table)?;
+        Ok(())
+    }
 }
 
 /// Implements [`Machine`] for an enum of drivers: each call goes to the chosen driver.

@@ -42,7 +42,7 @@ mod payload;
 mod plan_mismatch;
 mod range;
 
-pub use driver_factory::{DriverContext, DriverError, DriverFactory, Timing};
+pub use driver_factory::{ConnectionCheck, DriverContext, DriverError, DriverFactory, Timing};
 pub use driver_table::{AnyCmm, AnyGrinder, Wire};
 pub use error::DeviceError;
 use error::DeviceResult;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use super::error::FormatError;
 use super::registration::try_writing;
-use super::system::{is_socket, link_to};
+use super::system::is_socket;
 
 /// Writable folder; the folders that were created for it are removed again unless it is kept.
 #[derive(Debug)]
@@ -66,30 +66,6 @@ pub fn remove_socket(path: &Path) -> std::io::Result<()> {
         return Err(std::io::Error::from(std::io::ErrorKind::AlreadyExists));
     }
     fs::remove_file(path)
-}
-
-/// Creates a symbolic link at the path `link` that points to `device`. If a link already exists at this path, for
-/// example from an earlier simulation, it is replaced.
-///
-/// # Errors
-/// A file or folder at `link` that is not a link, which stays unchanged; a folder that is not writable; a system
-/// without symbolic links (Windows).
-pub fn place_link(device: &Path, link: &Path) -> std::io::Result<()> {
-    if fs::symlink_metadata(link).is_ok() {
-        remove_link(link)?;
-    }
-    link_to(device, link)
-}
-
-/// Removes the symbolic link `link`, but not the file to which it points.
-///
-/// # Errors
-/// Nothing at `link`; something that is not a link, which stays unchanged; a folder that is not writable.
-pub fn remove_link(link: &Path) -> std::io::Result<()> {
-    if !fs::symlink_metadata(link)?.file_type().is_symlink() {
-        return Err(std::io::Error::from(std::io::ErrorKind::AlreadyExists));
-    }
-    fs::remove_file(link)
 }
 
 /// Temporary folder for a comparison, removed with its content when this value is dropped.

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::cmm::{CmmExchange, CmmFolders, StationFiles, Stations};
 use super::grinder::{GrinderExchange, GrinderFolders};
@@ -22,7 +22,7 @@ use regrind_formats::{Columns, Unit};
 const FOLDER_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// Files in two folders, and a person.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ExchangeWire {
     /// Folder into which Regrind writes the jobs of the machine; relative to this file.
@@ -101,7 +101,7 @@ impl Default for ExchangeWire {
 }
 
 /// A station of a measurement.
-#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct StationTable {
     /// File of its points in the inbox; one `*` matches any characters.

@@ -8,7 +8,7 @@
 use std::fmt;
 
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 /// Letters of the axes, in order.
 const LETTERS: [char; 4] = ['X', 'Y', 'Z', 'W'];
@@ -19,7 +19,7 @@ const MAX_ANGLE_DEG: f64 = 36_000.0;
 const MAX_DIGITS: usize = 9;
 
 /// Format of a hit.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum LineFormat {
     /// `100.000,200.000,300.000`
@@ -79,7 +79,7 @@ impl LineFormat {
 }
 
 /// Separator between two values.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 #[expect(missing_docs, reason = "the names say it")]
 pub enum Separator {

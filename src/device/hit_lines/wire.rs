@@ -6,14 +6,14 @@ use regrind_document::Document;
 use regrind_formats::Unit;
 use regrind_formats::result::Coordinates;
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::link::HitSource;
 use super::machine::HitLinesCmm;
 use super::protocol::{LineFormat, LineParser, Separator};
 use super::settings::HitLinesSettings;
 use super::target_list::Repeated;
-use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
+use crate::driver_factory::{ConnectionCheck, DriverContext, DriverError, DriverFactory};
 use crate::machine_table::MachineTable;
 use crate::modbus::{Parity, serial_port};
 use crate::no_machine::NoMachine;
@@ -22,7 +22,7 @@ use crate::no_machine::NoMachine;
 pub(super) const AUTO: &str = "auto";
 
 /// A line for each hit, from a measuring machine or an arm that accepts no commands.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct HitLinesWire {
     /// Name of the serial port in the operating system; omit it if `host` names a terminal server. In a simulated cell
@@ -94,7 +94,7 @@ pub struct HitLinesWire {
 }
 
 /// Data bits of a serial line.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 #[expect(missing_docs, reason = "the names say it")]
 pub enum DataBits {
@@ -104,7 +104,7 @@ pub enum DataBits {
 }
 
 /// A decimal mark.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 #[expect(missing_docs, reason = "the names say it")]
 pub enum Mark {
@@ -114,7 +114,7 @@ pub enum Mark {
 }
 
 /// Axes of the three values.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 #[expect(missing_docs, reason = "the names say it")]
 pub enum Axes {
@@ -175,6 +175,7 @@ impl DriverFactory for HitLinesWire {
     type Grinder = NoMachine;
     const BY_PERSON: bool = true;
     const REPORTS_TEMPERATURE: bool = false;
+    const CHECK: ConnectionCheck = ConnectionCheck::Listen;
 
     fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         if place.table == "grinder" {
@@ -229,14 +230,21 @@ impl DriverFactory for HitLinesWire {
         Err(DriverError::NoDriver { table: "grinder", kind: "hit-lines" })
     }
 
-    fn hit_source(&self) -> Option<HitSource> {
-        Some(self.source())
+    fn address(&self) -> Option<String> {
+        Some(self.source().to_string())
+    }
+
+    fn has_open_address(&self) -> bool {
+        match self.source() {
+            HitSource::Serial { device, .. } => device == AUTO,
+            HitSource::Tcp { port, .. } => port == 0,
+        }
     }
 }
 
 impl HitLinesWire {
     /// Returns where the lines come from: a serial line or a TCP address.
-    pub fn source(&self) -> HitSource {
+    fn source(&self) -> HitSource {
         let Self { device, host, port, .. } = self.clone();
         match (device, host) {
             (Some(device), _) => HitSource::Serial {
@@ -250,17 +258,8 @@ impl HitLinesWire {
         }
     }
 
-    /// Returns true if the address of the machine is assigned only when the simulated machine starts: device "auto" or
-    /// port 0.
-    pub fn has_dynamic_address(&self) -> bool {
-        match self.source() {
-            HitSource::Serial { device, .. } => device == AUTO,
-            HitSource::Tcp { port, .. } => port == 0,
-        }
-    }
-
     /// Returns the parser of the lines, with the format that the cell file states.
-    pub fn parser(&self) -> LineParser {
+    fn parser(&self) -> LineParser {
         LineParser {
             // A cell file without this key is refused.
             format: self.format.unwrap_or(LineFormat::Decimal),

@@ -5,17 +5,17 @@ use std::time::Duration;
 
 use regrind_document::Document;
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::link::Limits;
 use super::machine::IppdmeCmm;
 use super::settings::{IppdmeSettings, Scanning};
-use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
+use crate::driver_factory::{ConnectionCheck, DriverContext, DriverError, DriverFactory};
 use crate::machine_table::MachineTable;
 use crate::no_machine::NoMachine;
 
 /// I++ DME over TCP, for a measuring machine.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct IppdmeWire {
     /// Name or address of the server.
@@ -90,6 +90,8 @@ impl DriverFactory for IppdmeWire {
     type Cmm = IppdmeCmm;
     type Grinder = NoMachine;
     const REPORTS_TEMPERATURE: bool = false;
+    const CHECK: ConnectionCheck = ConnectionCheck::Session;
+    const END_OF_JOB: &'static str = "the server of this machine stores no job, so there is no job to end; check that the probe is clear of the part";
 
     fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         if place.table == "grinder" {
@@ -144,8 +146,12 @@ impl DriverFactory for IppdmeWire {
         Err(DriverError::NoDriver { table: "grinder", kind: "ippdme" })
     }
 
-    fn ippdme_address(&self) -> Option<(String, u16)> {
-        Some((self.host.clone(), self.port))
+    fn address(&self) -> Option<String> {
+        Some(format!("{}:{}", self.host, self.port))
+    }
+
+    fn has_open_address(&self) -> bool {
+        self.port == 0
     }
 }
 

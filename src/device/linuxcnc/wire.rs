@@ -1,23 +1,21 @@
 //! Table of the cell file for LinuxCNC, and its driver factory.
 
 use std::net::IpAddr;
-use std::path::Path;
-use std::process::Command;
 use std::time::Duration;
 
 use regrind_document::Document;
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::machine::LinuxcncGrinder;
 use super::settings::LinuxcncSettings;
 use crate::MachineKind;
-use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
+use crate::driver_factory::{ConnectionCheck, DriverContext, DriverError, DriverFactory};
 use crate::machine_table::MachineTable;
 use crate::no_machine::NoMachine;
 
 /// LinuxCNC by linuxcncrsh over TCP, for a grinder.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct LinuxcncWire {
     /// Name or address of the controller.
@@ -78,6 +76,9 @@ impl DriverFactory for LinuxcncWire {
     type Cmm = NoMachine;
     type Grinder = LinuxcncGrinder;
     const READS_RUN_FOLDER: bool = true;
+    const CHECK: ConnectionCheck = ConnectionCheck::Session;
+    const END_OF_JOB: &'static str =
+        "the controller of this machine stores no job; if a program runs or is paused, end this program at the machine";
 
     fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         if place.table == "cmm" {
@@ -146,29 +147,12 @@ impl DriverFactory for LinuxcncWire {
         }))
     }
 
-    fn linuxcncrsh_address(&self) -> Option<(String, u16)> {
-        Some((self.host.clone(), self.port))
+    fn address(&self) -> Option<String> {
+        Some(format!("{}:{}", self.host, self.port))
     }
 }
 
 impl LinuxcncWire {
-    /// Returns the command that starts a helper program, from the key `executed_path` of the cell file. This program
-    /// prints the path that the LinuxCNC controller executes. A simulated cell needs the path to move its simulated
-    /// wheel.
-    ///
-    /// If the file name of the helper program contains a folder and is relative, it is relative to `cell_folder`.
-    /// Returns `None` if this key is missing or empty.
-    pub fn executed_path(&self, cell_folder: &Path) -> Option<Command> {
-        let (program, arguments) = self.executed_path.as_deref()?.split_first()?;
-        let at = Path::new(program);
-        let mut command = match at.components().count() {
-            0 | 1 => Command::new(program),
-            _ => Command::new(cell_folder.join(at)),
-        };
-        command.args(arguments);
-        Some(command)
-    }
-
     /// Checks the key `executed_path` of the cell file and reports errors to `document`. This key contains a helper
     /// program and its arguments; the program prints the path that the controller executes. `place` gives the table of
     /// the machine for the messages.

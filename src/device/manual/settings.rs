@@ -1,7 +1,7 @@
 //! Settings of a machine operated by a person, in a cell file.
 
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::{ManualMachine, ManualSettings};
 use crate::MachineKind;
@@ -10,7 +10,7 @@ use regrind_formats::result::{Content, Coordinates, DecimalMark};
 use regrind_formats::{Columns, Unit};
 
 /// A person, step by step.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ManualWire {
     /// Meaning of the coordinates of measurements, if the files do not state it; coordinates without a stated meaning

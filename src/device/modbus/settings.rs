@@ -105,7 +105,7 @@ impl std::fmt::Display for LineAddress {
 }
 
 /// Modbus over TCP.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct TcpWire {
     /// Name or address.
@@ -180,7 +180,7 @@ impl TcpWire {
 }
 
 /// Modbus over a serial line, eight data bits.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct RtuWire {
     /// Name of the serial device in the operating system.
@@ -241,7 +241,7 @@ impl RtuWire {
 }
 
 /// Addresses of the blocks of docs/modbus.md, from 0.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct RegisterMap {
     /// First word of a value of several registers: big is the high one.

@@ -3,7 +3,7 @@
 use super::drivers::{ModbusCmm, ModbusGrinder};
 use super::link::Link;
 use super::settings::{LineAddress, ModbusSettings, RtuWire, TcpWire};
-use crate::driver_factory::{DriverContext, DriverError, DriverFactory};
+use crate::driver_factory::{ConnectionCheck, DriverContext, DriverError, DriverFactory};
 use crate::machine_table::MachineTable;
 use regrind_document::Document;
 
@@ -12,7 +12,7 @@ macro_rules! modbus_wire {
         impl DriverFactory for $wire {
             type Cmm = ModbusCmm;
             type Grinder = ModbusGrinder;
-            const HAS_REGISTERS: bool = true;
+            const CHECK: ConnectionCheck = ConnectionCheck::Registers;
 
             fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
                 self.check_address(place, document);
@@ -38,6 +38,14 @@ macro_rules! modbus_wire {
 
             fn link(cmm: &ModbusCmm) -> Option<&Link> {
                 Some(cmm.link())
+            }
+
+            fn address(&self) -> Option<String> {
+                Some(format!("{}, unit {}", self.line(), self.unit))
+            }
+
+            fn has_open_address(&self) -> bool {
+                matches!(self.line(), LineAddress::Tcp { port: 0, .. })
             }
 
             fn modbus_line(&self) -> Option<(LineAddress, u8)> {

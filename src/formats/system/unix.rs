@@ -51,11 +51,6 @@ pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
     Ok(fs::symlink_metadata(path)?.file_type().is_socket())
 }
 
-/// Creates the symbolic link `link` to `device`.
-pub(crate) fn link_to(device: &Path, link: &Path) -> io::Result<()> {
-    std::os::unix::fs::symlink(device, link)
-}
-
 /// Flushes a folder to the disk, so that the names of its files last after a power failure.
 pub(crate) fn sync_folder(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()

@@ -45,12 +45,6 @@ pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
     fs::symlink_metadata(path).map(|_| false)
 }
 
-/// Returns an error in every case. On Windows, a device such as a serial port has only the name that the system gives
-/// it, so no link to it can be created.
-pub(crate) fn link_to(_: &Path, _: &Path) -> io::Result<()> {
-    Err(io::ErrorKind::Unsupported.into())
-}
-
 /// Does nothing and returns `Ok`. On Windows, a program cannot flush a folder, and the file system itself protects the
 /// names of files against a power failure.
 pub(crate) fn sync_folder(_: &Path) -> io::Result<()> {
