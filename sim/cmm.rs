@@ -25,6 +25,7 @@ use crate::payload::{BROKEN, Feature, INTERLOCK, Plan, PointRecord, Status, Targ
 use crate::probe::Placement;
 use crate::spec::{CmmSpec, REFERENCE_C, WorldFaults};
 use crate::truth::{Source, WorldState, empty_result, locked, stream};
+use crate::vector::{distance, length};
 use crate::{Rng, Vec3};
 
 /// Millimetres per count of scaled points: a nanometre.
@@ -79,12 +80,6 @@ fn approach_to(target: &Target, plan: &Plan, radius_mm: f64) -> Approach {
         from_mm: plan.approach_mm + plan.probe_radius_mm,
         to_mm: plan.probe_radius_mm - plan.search_mm,
     }
-}
-
-/// Rotates the vector `v` from the machine's frame to the part's frame, by the inverse rotation of `placement`. The
-/// translation of `placement` is not used.
-fn turned_back(placement: &Placement, v: Vec3) -> Vec3 {
-    std::array::from_fn(|i| (0..3).map(|k| placement.rotation[k][i] * v[k]).sum())
 }
 
 /// Prepared or running measurement.
@@ -145,7 +140,7 @@ impl Run {
         };
         let travel_mm = |k: usize| {
             let [from, to] = [k.max(1) - 1, k].map(|k| plan.targets[k].point_mm);
-            (0..3).map(|i| (to[i] - from[i]).powi(2)).sum::<f64>().sqrt()
+            distance(from, to)
         };
         let mut at_s = 0.0;
         let due = |k: usize| {
@@ -216,10 +211,9 @@ impl Run {
         // Contact of the expanded part with the ball equals contact of the part at drawing size with a ball reduced by
         // the same ratio.
         let growth = spec.growth();
-        let shifted = std::array::from_fn(|i| in_machine.point_mm[i] - self.placement.translation_mm[i]);
         let in_part = Approach {
-            point_mm: turned_back(&self.placement, shifted).map(|c| c / growth),
-            direction: turned_back(&self.placement, in_machine.direction),
+            point_mm: self.placement.apply_inverse(in_machine.point_mm).map(|c| c / growth),
+            direction: self.placement.turned_back(in_machine.direction),
             radius_mm: in_machine.radius_mm / growth,
             from_mm: in_machine.from_mm / growth,
             to_mm: in_machine.to_mm / growth,
@@ -241,7 +235,7 @@ impl Run {
         let is_outlier = self.outliers.random::<f64>() < spec.outlier_share;
         let size_mm = 1e-3 * spec.outlier_um * self.outliers.random::<f64>();
         let direction: Vec3 = std::array::from_fn(|_| normal(&mut self.outliers));
-        let norm = direction.iter().map(|c| c * c).sum::<f64>().sqrt();
+        let norm = length(direction);
         if !is_outlier || norm == 0.0 {
             return noise;
         }
@@ -378,7 +372,7 @@ impl TouchProbe {
 /// Returns the feature to which the point `point_mm` belongs. The feature is the reference sphere if the point is less
 /// than half a sphere radius from the sphere's surface. Otherwise the feature is the part.
 fn feature(spec: &CmmSpec, point_mm: Vec3) -> Feature {
-    let away_mm = (0..3).map(|k| (point_mm[k] - spec.sphere_centre_mm[k]).powi(2)).sum::<f64>().sqrt();
+    let away_mm = distance(point_mm, spec.sphere_centre_mm);
     if (away_mm - spec.sphere_radius_mm).abs() < 0.5 * spec.sphere_radius_mm {
         Feature::ReferenceSphere
     } else {

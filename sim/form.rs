@@ -5,6 +5,9 @@ use rand_distr::{Distribution, StandardNormal};
 
 use crate::Rng;
 
+/// Number of waves of a form error.
+const WAVES: u32 = 96;
+
 /// Gaussian random surface error with a Gaussian autocovariance, as a sum of plane waves.
 ///
 /// Many waves of random direction, phase and (Gaussian) wave number give heights that are nearly Gaussian, and exact
@@ -21,15 +24,7 @@ impl FormError {
     /// `width_mm` by `depth_mm`, centred on the origin. `correlation_length_mm` is the distance at which the
     /// autocovariance has fallen to 1/e.
     pub fn new(seed: u64, correlation_length_mm: f64, pv_mm: f64, width_mm: f64, depth_mm: f64) -> Self {
-        let mut rng = crate::rng(seed);
-        let sigma = 2f64.sqrt() / correlation_length_mm;
-        let waves = (0..96)
-            .map(|_| {
-                let [kx, ky]: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut rng));
-                [sigma * kx, sigma * ky, rng.random_range(0.0..std::f64::consts::TAU), 1.0]
-            })
-            .collect();
-        let mut error = Self { waves };
+        let mut error = Self::with_amplitude(&mut crate::rng(seed), correlation_length_mm, 1.0);
         let (low, high) = error.extremes(width_mm, depth_mm);
         for wave in &mut error.waves {
             wave[3] = pv_mm / (high - low);
@@ -42,15 +37,16 @@ impl FormError {
     ///
     /// The error is a sum of waves, and a wave of amplitude a has the mean square a^2/2.
     pub fn with_rms(rng: &mut Rng, correlation_length_mm: f64, rms_mm: f64) -> Self {
+        Self::with_amplitude(rng, correlation_length_mm, rms_mm * (2.0 / f64::from(WAVES)).sqrt())
+    }
+
+    fn with_amplitude(rng: &mut Rng, correlation_length_mm: f64, amplitude_mm: f64) -> Self {
         let sigma = 2f64.sqrt() / correlation_length_mm;
-        let amplitude = rms_mm * (2.0 / 96.0f64).sqrt();
-        let waves = (0..96)
-            .map(|_| {
-                let [kx, ky]: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut *rng));
-                [sigma * kx, sigma * ky, rng.random_range(0.0..std::f64::consts::TAU), amplitude]
-            })
-            .collect();
-        Self { waves }
+        let wave = |_| {
+            let [kx, ky]: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut *rng));
+            [sigma * kx, sigma * ky, rng.random_range(0.0..std::f64::consts::TAU), amplitude_mm]
+        };
+        Self { waves: (0..WAVES).map(wave).collect() }
     }
 
     /// Returns a form without any error.

@@ -72,6 +72,7 @@ pub mod simulators;
 pub mod spec;
 pub mod transfer;
 pub mod truth;
+mod vector;
 pub mod wire;
 pub mod world;
 

@@ -1,5 +1,7 @@
 //! Motion of a wheel: points with their feeds, joined by lines and arcs.
 
+use crate::vector::distance;
+
 /// Arc, the same for every control: about a centre in a plane of two axes, while the third axis moves in proportion to
 /// the angle.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -98,10 +100,12 @@ impl Waypoint {
 
     /// Returns the length of the move that begins at `from_mm`, in mm.
     pub fn length_mm(&self, from_mm: [f64; 3]) -> f64 {
-        let along = |k: usize| self.at_mm[k] - from_mm[k];
         match &self.arc {
-            Some(turn) => (turn.radius_mm(from_mm) * turn.sweep_rad).hypot(along(turn.axes[2])),
-            None => (0..3).map(|k| along(k).powi(2)).sum::<f64>().sqrt(),
+            Some(turn) => {
+                let across = turn.axes[2];
+                (turn.radius_mm(from_mm) * turn.sweep_rad).hypot(self.at_mm[across] - from_mm[across])
+            }
+            None => distance(from_mm, self.at_mm),
         }
     }
 

@@ -30,6 +30,7 @@ use serde::{Deserialize, Serialize};
 use crate::Vec3;
 use crate::form::FormError;
 use crate::shape::{Biconic, FreeForm, OffAxisAsphere, Shape, Sphere, ThroughOrigin, Wave, XyPolynomial};
+use crate::vector::{cross, dot, length, unit_normal};
 
 /// Spacing of the grid's nodes in mm; it is larger on a part where the grid would have over 400 nodes along a side.
 pub const NODE_SPACING_MM: f64 = 0.5;
@@ -586,7 +587,7 @@ impl Part {
         for _ in 0..40 {
             let ((r, tx, _), c) = (self.tangents(x, y, track), way.centre(t));
             let off: Vec3 = std::array::from_fn(|i| r[i] - c[i]);
-            let miss = [dot(off, off).sqrt() - way.radius_mm, dot(off, tx)];
+            let miss = [length(off) - way.radius_mm, dot(off, tx)];
             let size = miss[0].abs().max(miss[1].abs());
             if !size.is_finite() || size < 1e-14 || (size < 1e-11 && size >= last) {
                 last = last.min(size);
@@ -596,8 +597,8 @@ impl Part {
             const STEP_MM: f64 = 1e-4;
             let [ahead, behind] = [x + STEP_MM, x - STEP_MM].map(|x| self.tangents(x, y, track).1);
             let bend: Vec3 = std::array::from_fn(|i| (ahead[i] - behind[i]) / (2.0 * STEP_MM));
-            let length = dot(off, off).sqrt();
-            let (a, b) = (miss[1] / length, -dot(off, way.direction) / length);
+            let off_mm = length(off);
+            let (a, b) = (miss[1] / off_mm, -dot(off, way.direction) / off_mm);
             let (c, d) = (dot(tx, tx) + dot(off, bend), -dot(way.direction, tx));
             let determinant = a * d - b * c;
             let step = [(d * miss[0] - b * miss[1]) / determinant, (a * miss[1] - c * miss[0]) / determinant];
@@ -645,20 +646,6 @@ impl Part {
         }
         (last < 1e-10).then_some(([at[0], at[1]], at[2]))
     }
-}
-
-fn unit_normal(tx: Vec3, ty: Vec3) -> Vec3 {
-    let m = cross(tx, ty);
-    let norm = dot(m, m).sqrt();
-    m.map(|c| c / norm)
-}
-
-fn cross(a: Vec3, b: Vec3) -> Vec3 {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-fn dot(a: Vec3, b: Vec3) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
 /// Solves three linear equations by Cramer's rule: the columns a, b, c of the matrix, and the right side. Returns

@@ -9,6 +9,7 @@
 
 use crate::Vec3;
 use crate::body::Refusal;
+use crate::vector::length;
 
 /// Maximum number of targets in a plan.
 pub const MAX_TARGETS: u32 = 500_000;
@@ -235,7 +236,7 @@ impl Target {
         };
         reader.zeros::<2>("what")?;
         let (point_mm, normal) = (reader.vector("point of a target")?, reader.vector::<3>("normal of a target")?);
-        let length = normal.iter().map(|c| c * c).sum::<f64>().sqrt();
+        let length = length(normal);
         // Written so that an overflow to infinity is refused too.
         if (length - 1.0).abs() <= 1e-6 {
             let normal = normal.map(|c| c / length);

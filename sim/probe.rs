@@ -5,6 +5,7 @@ use rand_distr::{Distribution, StandardNormal};
 
 use crate::form::FormError;
 use crate::shape::Shape;
+use crate::vector::{cross, dot, length};
 use crate::{Rng, Vec3};
 
 /// Rigid motion, given by its rotation matrix (rows) and its translation.
@@ -55,10 +56,23 @@ impl Placement {
     /// Transforms the point `p` from the part's frame to the machine's frame, by the rotation and then the translation
     /// of this placement.
     pub fn apply(&self, p: Vec3) -> Vec3 {
-        std::array::from_fn(|i| {
-            let r = &self.rotation[i];
-            r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + self.translation_mm[i]
-        })
+        let turned = self.turned(p);
+        std::array::from_fn(|i| turned[i] + self.translation_mm[i])
+    }
+
+    /// Transforms the point `p` back, from the machine's frame to the part's frame.
+    pub(crate) fn apply_inverse(&self, p: Vec3) -> Vec3 {
+        self.turned_back(std::array::from_fn(|i| p[i] - self.translation_mm[i]))
+    }
+
+    /// Rotates the direction `v` from the part's frame to the machine's frame.
+    pub(crate) fn turned(&self, v: Vec3) -> Vec3 {
+        self.rotation.map(|row| dot(row, v))
+    }
+
+    /// Rotates the direction `v` back, from the machine's frame to the part's frame.
+    pub(crate) fn turned_back(&self, v: Vec3) -> Vec3 {
+        std::array::from_fn(|i| (0..3).map(|k| self.rotation[k][i] * v[k]).sum())
     }
 }
 
@@ -89,8 +103,8 @@ pub fn centre(shape: &dyn Shape, form: &FormError, radius_mm: f64, x: f64, y: f6
     let (nx, ny) = (dn(h, 0.0), dn(0.0, h));
     let tx: Vec3 = std::array::from_fn(|i| [1.0, 0.0, p][i] + ex * n[i] + e * nx[i]);
     let ty: Vec3 = std::array::from_fn(|i| [0.0, 1.0, q][i] + ey * n[i] + e * ny[i]);
-    let m = [tx[1] * ty[2] - tx[2] * ty[1], tx[2] * ty[0] - tx[0] * ty[2], tx[0] * ty[1] - tx[1] * ty[0]];
-    let norm = (m[0] * m[0] + m[1] * m[1] + m[2] * m[2]).sqrt();
+    let m = cross(tx, ty);
+    let norm = length(m);
     std::array::from_fn(|i| s[i] + e * n[i] + radius_mm * m[i] / norm)
 }
 

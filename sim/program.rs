@@ -13,6 +13,7 @@ use std::collections::BTreeMap;
 
 use crate::head::Head;
 use crate::motion::{CircularArc, Waypoint};
+use crate::vector::distance;
 
 /// Kind of control.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -83,7 +84,7 @@ impl Program {
         match self.axis {
             Some(_) => {
                 let [a, b] = [0.0, 1.0].map(|share| self.centre_mm(from, to, share));
-                (0..3).map(|k| (b[k] - a[k]).powi(2)).sum::<f64>().sqrt()
+                distance(a, b)
             }
             None => to.length_mm(from.at_mm),
         }
@@ -137,7 +138,35 @@ impl Control {
     }
 }
 
-#[derive(Default)]
+/// Reader of a program of LinuxCNC line by line, as its interpreter reads ahead of the motion.
+#[derive(Clone)]
+pub(crate) struct LineReader(Reader);
+
+impl LineReader {
+    /// Creates the reader of a program that begins at the position `at_mm`.
+    pub(crate) fn new(at_mm: [f64; 3]) -> Self {
+        Self(Reader { at_mm: Some(at_mm), ..Reader::default() })
+    }
+
+    /// Reads one line. Returns the move that it commands, with the position at which the move begins. Returns `None` if
+    /// the line commands no move.
+    ///
+    /// # Errors
+    /// Returns the reason why the line is not allowed in the program of a pass.
+    pub(crate) fn read(&mut self, line: &str) -> Result<Option<([f64; 3], Waypoint)>, String> {
+        let from_mm = self.0.at_mm.unwrap_or_default();
+        self.0.program = Program::default();
+        self.0.line(line)?;
+        Ok(self.0.program.waypoints.pop().map(|waypoint| (from_mm, waypoint)))
+    }
+
+    /// Returns true if the program has ended.
+    pub(crate) fn has_ended(&self) -> bool {
+        self.0.ended
+    }
+}
+
+#[derive(Clone, Default)]
 struct Reader {
     control: Control,
     program: Program,
@@ -345,8 +374,7 @@ impl Reader {
             }
         }
         let minutes = feed.filter(|_| self.by_time).map(|inverse| 1.0 / inverse);
-        let feed_mm_min = minutes
-            .map_or(feed, |minutes| Some((0..3).map(|k| (at_mm[k] - before[k]).powi(2)).sum::<f64>().sqrt() / minutes));
+        let feed_mm_min = minutes.map_or(feed, |minutes| Some(distance(before, at_mm) / minutes));
         if self.by_time {
             self.feed = None;
         }

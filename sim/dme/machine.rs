@@ -7,6 +7,8 @@ use super::event::MachineEvent;
 use super::line::{Argument, Command, DmeError};
 use crate::Vec3;
 use crate::cmm::{TouchProbe, TouchResult};
+use crate::probe::Placement;
+use crate::vector::{distance, length};
 
 /// Options of the server and its machine.
 #[derive(Clone, Debug)]
@@ -69,54 +71,26 @@ const PARAMETERS: [&str; 7] = [
 
 const FIRST_PARAMETERS: [f64; 7] = [50.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0];
 
-/// Frame: rows of the rotation from the machine's frame to this frame, and the machine's origin in it.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Frame {
-    rows: [Vec3; 3],
-    origin: Vec3,
-    written: [f64; 6],
-}
-
-impl Frame {
-    const MACHINE: Self =
-        Self { rows: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], origin: [0.0; 3], written: [0.0; 6] };
-
-    /// Creates a frame from `written`, six numbers. The first three are x, y, z of the machine's origin in this frame,
-    /// in mm. The last three are the Euler angles theta, psi, phi in degrees. The matrix Rz(phi) Rx(theta) Rz(psi)
-    /// rotates a direction from the machine's frame to this frame.
-    fn new(written: [f64; 6]) -> Self {
-        let [x, y, z, theta, psi, phi] = written;
-        let about_z = |deg: f64| {
-            let (s, c) = deg.to_radians().sin_cos();
-            [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
-        };
-        let (s, c) = theta.to_radians().sin_cos();
-        let about_x = [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]];
-        let rows = times(times(about_z(phi), about_x), about_z(psi));
-        Self { rows, origin: [x, y, z], written }
-    }
-
-    fn turned(&self, v: Vec3) -> Vec3 {
-        self.rows.map(|row| (0..3).map(|k| row[k] * v[k]).sum())
-    }
-
-    pub(super) fn turned_back(&self, v: Vec3) -> Vec3 {
-        std::array::from_fn(|k| (0..3).map(|i| self.rows[i][k] * v[i]).sum())
-    }
-
-    pub(super) fn machine_to_part(&self, at: Vec3) -> Vec3 {
-        let turned = self.turned(at);
-        std::array::from_fn(|k| turned[k] + self.origin[k])
-    }
-
-    pub(super) fn to_machine(self, at: Vec3) -> Vec3 {
-        self.turned_back(std::array::from_fn(|k| at[k] - self.origin[k]))
-    }
+/// Creates the placement of the machine's frame in a frame that is written as six numbers. The first three are x, y, z
+/// of the machine's origin in this frame, in mm. The last three are the Euler angles theta, psi, phi in degrees. The
+/// matrix Rz(phi) Rx(theta) Rz(psi) rotates a direction from the machine's frame to this frame.
+fn frame([x, y, z, theta, psi, phi]: [f64; 6]) -> Placement {
+    let about_z = |deg: f64| {
+        let (s, c) = deg.to_radians().sin_cos();
+        [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+    };
+    let (s, c) = theta.to_radians().sin_cos();
+    let about_x = [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]];
+    let rotation = times(times(about_z(phi), about_x), about_z(psi));
+    Placement { rotation, translation_mm: [x, y, z] }
 }
 
 fn times(a: [Vec3; 3], b: [Vec3; 3]) -> [Vec3; 3] {
     a.map(|row| std::array::from_fn(|k| (0..3).map(|i| row[i] * b[i][k]).sum()))
 }
+
+/// Frame of a part that is the machine's frame.
+const MACHINE_FRAME: ([f64; 6], Placement) = ([0.0; 6], Placement::IDENTITY);
 
 /// Simulated machine.
 pub struct DmeMachine {
@@ -125,7 +99,8 @@ pub struct DmeMachine {
     homed: bool,
     tool: String,
     pub(super) parameters: [f64; 7],
-    part_frame: Frame,
+    /// Frame of the part as it was written, and the placement of the machine's frame in it.
+    part_frame: ([f64; 6], Placement),
     in_part_frame: bool,
     report: Vec<String>,
     pub(super) scan_report: Vec<String>,
@@ -159,7 +134,7 @@ impl DmeMachine {
             probe,
             tool: "NoTool".into(),
             parameters: FIRST_PARAMETERS,
-            part_frame: Frame::MACHINE,
+            part_frame: MACHINE_FRAME,
             in_part_frame: false,
             report: Vec::new(),
             scan_report: Vec::new(),
@@ -219,7 +194,7 @@ impl DmeMachine {
         self.homed = false;
         self.tool = "NoTool".into();
         self.parameters = FIRST_PARAMETERS;
-        (self.part_frame, self.in_part_frame, self.joystick) = (Frame::MACHINE, false, true);
+        (self.part_frame, self.in_part_frame, self.joystick) = (MACHINE_FRAME, false, true);
     }
 
     /// Moves the probe to the target position of its current motion, and ends the motion.
@@ -308,22 +283,16 @@ impl DmeMachine {
                 if !(0.0..=180.0).contains(&written[3]) {
                     return Err(no(1007));
                 }
-                self.part_frame = Frame::new(written);
+                self.part_frame = (written, frame(written));
                 Ok(CommandResult::default())
             }
             ("SetProp", properties) => self.set(properties, &command.name).map_err(no),
             ("OnPtMeasReport", fields) => {
-                let names: Option<Vec<String>> = fields.iter().map(query_name).collect();
-                let known = ["X", "Y", "Z", "IJK", "ER", "Q"];
-                let names = names.filter(|names| names.iter().all(|name| known.contains(&name.as_str())));
-                self.report = names.ok_or_else(|| no(502))?;
+                self.report = query_names(fields, &["X", "Y", "Z", "IJK", "ER", "Q"]).ok_or_else(|| no(502))?;
                 Ok(CommandResult::default())
             }
             ("OnScanReport", fields) => {
-                let names: Option<Vec<String>> = fields.iter().map(query_name).collect();
-                let known = ["X", "Y", "Z", "Q"];
-                let names = names.filter(|names| names.iter().all(|name| known.contains(&name.as_str())));
-                self.scan_report = names.ok_or_else(|| no(502))?;
+                self.scan_report = query_names(fields, &["X", "Y", "Z", "Q"]).ok_or_else(|| no(502))?;
                 Ok(CommandResult::default())
             }
             ("ScanOnCurveHint", [Argument::Number(_), Argument::Number(_)]) => Ok(CommandResult::default()),
@@ -343,9 +312,8 @@ impl DmeMachine {
         match (command.name.as_str(), &command.arguments[..]) {
             ("GetDMEVersion", []) => text(format!("DMEVersion(\"{}\")", self.options.version)),
             ("GetMachineClass", []) => text(format!("GetMachineClass(\"{}\")", self.options.class)),
-            ("IsHomed", []) => text(format!("IsHomed({})", u8::from(self.homed))),
+            ("IsHomed" | "GetXtdErrStatus", []) => text(format!("IsHomed({})", u8::from(self.homed))),
             ("IsUserEnabled", []) => text(format!("IsUserEnabled({})", u8::from(self.joystick))),
-            ("GetXtdErrStatus", []) => text(format!("IsHomed({})", u8::from(self.homed))),
             ("EnumTools", []) => {
                 let data = self.options.tools.iter().map(|(name, _)| vec![format!("\"{name}\"")]).collect();
                 Ok(CommandResult { data, ..CommandResult::default() })
@@ -354,12 +322,12 @@ impl DmeMachine {
                 text(format!("CoordSystem({})", if self.in_part_frame { "PartCsy" } else { "MachineCsy" }))
             }
             ("GetCsyTransformation", [Argument::Name(name, None)]) if name == "PartCsy" => {
-                let numbers = self.part_frame.written.map(|n| n.to_string()).join(", ");
+                let numbers = self.part_frame.0.map(|n| n.to_string()).join(", ");
                 text(format!("GetCsyTransformation({numbers})"))
             }
             ("GetProp", properties) => self.get(properties).map_err(no),
             ("Get", fields) => {
-                let at = self.frame().machine_to_part(self.at_mm);
+                let at = self.frame().apply(self.at_mm);
                 let told = fields.iter().map(|field| {
                     let name = query_name(field)?;
                     let k = ["X", "Y", "Z"].iter().position(|axis| *axis == name)?;
@@ -371,15 +339,16 @@ impl DmeMachine {
         }
     }
 
-    pub(super) fn frame(&self) -> Frame {
-        if self.in_part_frame { self.part_frame } else { Frame::MACHINE }
+    /// Returns the placement of the machine's frame in the selected frame.
+    pub(super) fn frame(&self) -> Placement {
+        if self.in_part_frame { self.part_frame.1 } else { Placement::IDENTITY }
     }
 
     /// Returns the position that the arguments X, Y and Z of a command describe, in mm. The arguments are in the
     /// selected frame. The returned position is in the machine's frame. A missing axis keeps its present value. The
     /// argument IJK is ignored. Returns `None` if `axes` contains any other argument.
     fn place(&self, axes: &[Argument]) -> Option<Vec3> {
-        let mut at = self.frame().machine_to_part(self.at_mm);
+        let mut at = self.frame().apply(self.at_mm);
         for axis in axes {
             let Argument::Name(name, Some(numbers)) = axis else { return None };
             match (name.as_str(), &numbers[..]) {
@@ -390,7 +359,7 @@ impl DmeMachine {
                 _ => return None,
             }
         }
-        Some(self.frame().to_machine(at))
+        Some(self.frame().apply_inverse(at))
     }
 
     pub(super) fn check_volume(&self, at: Vec3) -> Result<(), u16> {
@@ -400,7 +369,6 @@ impl DmeMachine {
     }
 
     pub(super) fn start_motion(&mut self, to_mm: Vec3) -> CommandResult {
-        let way_mm = (0..3).map(|k| (to_mm[k] - self.at_mm[k]).powi(2)).sum::<f64>().sqrt();
         self.to_mm = to_mm;
         self.events.push(MachineEvent::MotionStarted {
             command: self.current_command.clone(),
@@ -408,7 +376,7 @@ impl DmeMachine {
             to_mm,
         });
         let speed = self.parameters[0].min(self.probe.travel_mm_s());
-        CommandResult { seconds: way_mm / speed, ..CommandResult::default() }
+        CommandResult { seconds: distance(self.at_mm, to_mm) / speed, ..CommandResult::default() }
     }
 
     /// Touches the simulated part or the reference sphere. `axes` are the arguments of PtMeas: the target X, Y, Z in mm
@@ -430,11 +398,11 @@ impl DmeMachine {
             _ => None,
         });
         let direction = self.frame().turned_back(direction.ok_or(502u16)?);
-        let length = direction.iter().map(|c| c * c).sum::<f64>().sqrt();
-        if length == 0.0 {
+        let norm = length(direction);
+        if norm == 0.0 {
             return Err(1010);
         }
-        let normal = direction.map(|c| c / length);
+        let normal = direction.map(|c| c / norm);
         let radius_mm = self.radius().ok_or(508u16)?;
         let [_, _, approach_mm, search_mm, retract_mm, ..] = self.parameters;
         let on_way = |mm: f64| -> Vec3 { std::array::from_fn(|k| point_mm[k] + mm * normal[k]) };
@@ -469,7 +437,7 @@ impl DmeMachine {
 
     fn reported(&self, centre: Vec3, normal: Vec3, radius_mm: f64) -> Vec<String> {
         let frame = self.frame();
-        let (at, inward) = (frame.machine_to_part(centre), frame.turned(normal));
+        let (at, inward) = (frame.apply(centre), frame.turned(normal));
         let field = |name: &String| match name.as_str() {
             "X" => format!("X({})", at[0]),
             "Y" => format!("Y({})", at[1]),
@@ -533,4 +501,10 @@ fn query_name(argument: &Argument) -> Option<String> {
         Argument::Name(name, Some(numbers)) if numbers.is_empty() => Some(name.clone()),
         _ => None,
     }
+}
+
+/// Returns the names of the properties that arguments request. Returns `None` if one of them is not in `known`.
+fn query_names(arguments: &[Argument], known: &[&str]) -> Option<Vec<String>> {
+    let known = |name: &String| known.contains(&name.as_str());
+    arguments.iter().map(|argument| query_name(argument).filter(known)).collect()
 }

@@ -6,6 +6,7 @@ use super::line::Scanned;
 use super::machine::{CommandResult, DmeMachine};
 use crate::Vec3;
 use crate::cmm::TouchResult;
+use crate::vector::{distance, length};
 
 /// Number of points in a line.
 const IN_A_LINE: usize = 7;
@@ -43,13 +44,13 @@ impl DmeMachine {
         let mut last: Option<Vec3> = None;
         let mut normal = [0.0, 0.0, 1.0];
         for (k, row) in numbers.chunks_exact(7).enumerate() {
-            let point = frame.to_machine([row[0], row[1], row[2]]);
+            let point = frame.apply_inverse([row[0], row[1], row[2]]);
             let direction = frame.turned_back([row[3], row[4], row[5]]);
-            let length = direction.iter().map(|c| c * c).sum::<f64>().sqrt();
-            if length == 0.0 || row[6] != 1.0 {
-                return Err(if length == 0.0 { 1010 } else { 506 });
+            let norm = length(direction);
+            if norm == 0.0 || row[6] != 1.0 {
+                return Err(if norm == 0.0 { 1010 } else { 506 });
             }
-            normal = direction.map(|c| c / length);
+            normal = direction.map(|c| c / norm);
             let over: Vec3 = std::array::from_fn(|k| point[k] + (approach_mm + radius_mm) * normal[k]);
             self.check_volume(over)?;
             let centre = match self.probe.touch(point, normal, [radius_mm, approach_mm, search_mm]) {
@@ -67,7 +68,7 @@ impl DmeMachine {
             if k.is_multiple_of(IN_A_LINE) {
                 done.scanned.push_back(Scanned { seconds: 0.0, at_mm: centre, points: Vec::new() });
             }
-            let told = frame.machine_to_part(centre);
+            let told = frame.apply(centre);
             let fields = self.scan_report.iter().map(|name| match name.as_str() {
                 "X" => told[0].to_string(),
                 "Y" => told[1].to_string(),
@@ -84,10 +85,6 @@ impl DmeMachine {
         self.start_motion(std::array::from_fn(|k| end[k] + retract_mm.max(0.0) * normal[k]));
         Ok(done)
     }
-}
-
-fn distance(a: Vec3, b: Vec3) -> f64 {
-    (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
 }
 
 /// Returns the fields of all points of a scan line as one list, in the order of the points. Three values of `fault`

@@ -1,20 +1,6 @@
 //! List of targets, as a part program reads it: rows of `index,x,y,z,nx,ny,nz,what` after comments and a header.
 
-use crate::Vec3;
-use crate::payload::Feature;
-
-/// Target of a touch.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Target {
-    /// Number of the target.
-    pub index: u32,
-    /// Nominal point, in mm.
-    pub point_mm: Vec3,
-    /// Outward unit normal at the point.
-    pub normal: Vec3,
-    /// Feature that the target is on.
-    pub feature: Feature,
-}
+use crate::payload::{Feature, Target};
 
 /// List of targets.
 #[derive(Clone, Debug, PartialEq)]

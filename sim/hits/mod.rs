@@ -18,7 +18,7 @@ pub(crate) mod simulator;
 use std::time::Duration;
 
 use crate::cmm::{TouchProbe, TouchResult};
-use crate::payload::Feature;
+use crate::payload::{Feature, Target};
 use faults::{Fault, PrintFaults};
 use list::List;
 use print::Style;
@@ -89,7 +89,7 @@ impl PartProgram {
         Some(out)
     }
 
-    fn touch(&mut self, target: &list::Target) -> Outgoing {
+    fn touch(&mut self, target: &Target) -> Outgoing {
         let Options { radius_mm, search_mm: [before, beyond], .. } = self.options;
         let touched = self.probe.touch(target.point_mm, target.normal, [radius_mm, before, beyond]);
         let TouchResult::Centre(centre_mm) = touched else { return Outgoing { bytes: Vec::new(), hangs_up: false } };

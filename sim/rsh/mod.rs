@@ -24,6 +24,7 @@ use std::time::Duration;
 
 use crate::Vec3;
 use crate::executed_wheel::Wheel;
+use crate::vector::distance;
 use event::{ControllerEvent, Observer};
 use faults::{Fault, LineFaults};
 use program::{LogAction, Program, Step, says};
@@ -528,7 +529,7 @@ impl LineServer for Controller {
                         self.errors.push_back(format!("Linear move on line {line} would exceed X's positive limit"));
                         return self.break_off();
                     }
-                    let way_mm = (0..3).map(|k| (to_mm[k] - self.at_mm[k]).powi(2)).sum::<f64>().sqrt();
+                    let way_mm = distance(self.at_mm, to_mm);
                     let goes_mm = (left_s * mm_s).min(way_mm);
                     self.go(to_mm, [way_mm, goes_mm], mm_s);
                     if goes_mm < way_mm {

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use crate::Vec3;
-use crate::motion::{CircularArc, Waypoint};
+use crate::program::LineReader;
 
 /// Maximum number of motions that are read ahead.
 const MAX_QUEUED_STEPS: usize = 200;
@@ -11,15 +11,15 @@ const MAX_QUEUED_STEPS: usize = 200;
 const RAPID_MM_S: f64 = 100.0;
 /// Maximum distance of the chords of an arc from the arc, in mm.
 const CHORDS_MM: f64 = 1e-5;
-/// Maximum difference of the radii at both ends of an arc, in mm.
-const RADII_MM: f64 = 0.005;
+/// Line that makes the interpreter wait for all earlier motion, because it asks for an input.
+const INPUT_WAIT: &str = "M66";
 
 /// Queued step, carried out in its turn.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Step {
     /// Straight move to a position.
     Move { to_mm: Vec3, mm_s: f64, line: u32 },
-    /// Arc that cannot be executed.
+    /// Line that cannot be executed.
     Refused { reason: String, line: u32 },
     /// Barrier: the lines after it are read only when the motion has reached it.
     Wait { line: u32 },
@@ -39,7 +39,7 @@ pub(super) enum LogAction {
 }
 
 /// Open program.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub(super) struct Program {
     pub(super) path: String,
     pub(super) text: String,
@@ -48,13 +48,7 @@ pub(super) struct Program {
     next: usize,
     /// Index of the line at which a loop began, and the number of repetitions left.
     repeats: Option<(usize, u32)>,
-    at_mm: Vec3,
-    /// Motion mode: 0 rapid, 1 at feed, 2 and 3 along an arc, clockwise and counter-clockwise.
-    motion: u8,
-    plane: [usize; 3],
-    /// True if centres are absolute (G90.1), false if they are relative to the beginning of an arc (G91.1).
-    centres_are_absolute: bool,
-    mm_s: f64,
+    reader: LineReader,
     /// True if nothing is read until the queued steps have been carried out.
     waits: bool,
 }
@@ -62,22 +56,8 @@ pub(super) struct Program {
 impl Program {
     pub(super) fn new(path: &str, text: String) -> Self {
         let lines = text.lines().map(str::to_owned).collect();
-        let (next, repeats, waits) = (0, None, false);
-        let (at_mm, plane) = ([0.0; 3], [0, 1, 2]);
-        let (motion, centres_are_absolute, mm_s) = (0, false, 0.0);
-        Self {
-            path: path.to_owned(),
-            text,
-            lines,
-            next,
-            repeats,
-            at_mm,
-            motion,
-            plane,
-            centres_are_absolute,
-            mm_s,
-            waits,
-        }
+        let reader = LineReader::new([0.0; 3]);
+        Self { path: path.to_owned(), text, lines, next: 0, repeats: None, reader, waits: false }
     }
 
     /// Returns the number of lines of the program.
@@ -89,8 +69,7 @@ impl Program {
     /// new program. `at_mm` is the position from which the first move starts, in mm.
     pub(super) fn rewind(&mut self, at_mm: Vec3) {
         (self.next, self.repeats, self.waits) = (0, None, false);
-        (self.at_mm, self.motion, self.mm_s) = (at_mm, 0, 0.0);
-        (self.plane, self.centres_are_absolute) = ([0, 1, 2], false);
+        self.reader = LineReader::new(at_mm);
     }
 
     /// Allows [`Self::read_on`] to read further lines. [`Self::read_on`] stops at a line that waits for the motion
@@ -133,64 +112,24 @@ impl Program {
     }
 
     fn code(&mut self, text: &str, line: u32, steps: &mut VecDeque<Step>) {
-        let (mut to_mm, mut moves) = (self.at_mm, false);
-        let mut centre = [None; 3];
-        for (letter, value) in words(text) {
-            match (letter, value) {
-                ('G', 0.0 | 1.0 | 2.0 | 3.0) => self.motion = value as u8,
-                ('G', 17.0) => self.plane = [0, 1, 2],
-                ('G', 18.0) => self.plane = [2, 0, 1],
-                ('G', 19.0) => self.plane = [1, 2, 0],
-                ('G', 90.1 | 91.1) => self.centres_are_absolute = value == 90.1,
-                ('I' | 'J' | 'K', mm) => centre[letter as usize - 'I' as usize] = Some(mm),
-                ('F', feed) => self.mm_s = feed / 60.0,
-                ('X' | 'Y' | 'Z', mm) => {
-                    to_mm[letter as usize - 'X' as usize] = mm;
-                    moves = true;
-                }
-                ('M', 66.0) => {
-                    steps.push_back(Step::Wait { line });
-                    self.waits = true;
-                }
-                ('M', 2.0 | 30.0) => {
-                    steps.push_back(Step::End { line });
-                    self.waits = true;
-                }
-                _ => {}
-            }
+        if text.starts_with(INPUT_WAIT) {
+            steps.push_back(Step::Wait { line });
+            self.waits = true;
+            return;
         }
-        if moves {
-            let mm_s = if self.motion > 0 { self.mm_s.max(1e-3) } else { RAPID_MM_S };
-            match self.way(to_mm, centre) {
-                Ok(stop) => {
-                    let chords = stop.in_chords(self.at_mm, CHORDS_MM);
-                    steps.extend(chords.into_iter().map(|to_mm| Step::Move { to_mm, mm_s, line }));
-                }
-                Err(reason) => steps.push_back(Step::Refused { reason, line }),
+        match self.reader.read(text) {
+            Ok(Some((from_mm, waypoint))) => {
+                let mm_s = waypoint.feed_mm_min.map_or(RAPID_MM_S, |feed| (feed / 60.0).max(1e-3));
+                let chords = waypoint.in_chords(from_mm, CHORDS_MM);
+                steps.extend(chords.into_iter().map(|to_mm| Step::Move { to_mm, mm_s, line }));
             }
-            self.at_mm = to_mm;
+            Ok(None) => {}
+            Err(reason) => steps.push_back(Step::Refused { reason, line }),
         }
-    }
-
-    /// Returns the move from the present position to `to_mm`, in mm. The move is an arc if an arc mode (G2 or G3) is
-    /// active. Otherwise it is straight.
-    ///
-    /// `centre` contains the words I, J and K of the line, in mm. These words give the centre of the arc. They are
-    /// relative to the present position by default (G91.1), and absolute in the mode G90.1. A missing word counts as 0.
-    ///
-    /// # Errors
-    /// Returns the reason if no arc about this centre joins the two positions.
-    fn way(&self, to_mm: Vec3, centre: [Option<f64>; 3]) -> Result<Waypoint, String> {
-        let turn = match self.motion {
-            motion @ (2 | 3) => {
-                let begin = |axis: usize| if self.centres_are_absolute { 0.0 } else { self.at_mm[axis] };
-                let [a, b, _] = self.plane;
-                let about = [a, b].map(|axis| begin(axis) + centre[axis].unwrap_or(0.0));
-                Some(CircularArc::new(self.plane, [self.at_mm, to_mm], about, motion == 2, RADII_MM)?)
-            }
-            _ => None,
-        };
-        Ok(Waypoint { at_mm: to_mm, rotary_deg: None, feed_mm_min: None, minutes: None, arc: turn })
+        if self.reader.has_ended() {
+            steps.push_back(Step::End { line });
+            self.waits = true;
+        }
     }
 }
 
@@ -209,27 +148,14 @@ pub(super) fn says(text: &str) -> Option<LogAction> {
     })
 }
 
-/// Returns the words of the line `text` of a G-code program. A word is a letter and its number; the letter is returned
-/// in upper case. Everything after the first `;` or `(` is a comment and is ignored. A letter without a valid number is
-/// omitted.
-fn words(text: &str) -> Vec<(char, f64)> {
-    let code = text.split([';', '(']).next().unwrap_or_default();
-    let starts: Vec<usize> = code.char_indices().filter(|(_, c)| c.is_ascii_alphabetic()).map(|(at, _)| at).collect();
-    let ends = starts.iter().skip(1).copied().chain([code.len()]);
-    let word = |(from, to): (&usize, usize)| {
-        let letter = code[*from..].chars().next()?.to_ascii_uppercase();
-        Some((letter, code[from + 1..to].trim().parse().ok()?))
-    };
-    starts.iter().zip(ends).filter_map(word).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn log_precedes_motion_until_input_wait() {
-        let text = "(LOG,a)\nG21 G90\nG64 P0.0001 Q0\nG0 Z5\nG1 X1.5Y-2Z0.25F600\n(LOG,b)\nM66 P0 L0\n(LOG,c)\nM2\n";
+        let text =
+            "(LOG,a)\nG21 G90 G94\nG64 P0.0001 Q0\nG0 Z5\nG1 X1.5Y-2Z0.25F600\n(LOG,b)\nM66 P0 L0\n(LOG,c)\nM2\n";
         let (mut program, mut steps) = (Program::new("p", text.to_owned()), VecDeque::new());
         let log = |word: &str| LogAction::Log(word.to_owned());
         assert_eq!(program.read_on(&mut steps), [log("a"), log("b")]);
@@ -247,7 +173,7 @@ mod tests {
 
     #[test]
     fn rsh_arc_stays_in_plane_or_refused() {
-        let text = "G91.1\nG0 X3Y1Z9\nG18 G3 X3Z5I0K-2F600\nG90.1 G2 X3Z9I3K7\nG91.1 X4Z5K-2\nM2\n";
+        let text = "G21 G90 G94 G61 G91.1\nG0 X3Y1Z9\nG18 G3 X3Z5I0K-2F600\nG90.1 G2 X3Z9I3K7\nG91.1 X4Z5I0K-2\nM2\n";
         let (mut program, mut steps) = (Program::new("p", text.to_owned()), VecDeque::new());
         let mut ahead = VecDeque::new();
         // It continues to read when the steps it has read are carried out.
@@ -276,7 +202,7 @@ mod tests {
 
     #[test]
     fn rsh_repeat_loop_expands() {
-        let text = "o<regrind> repeat [3]\nG1 X1 F60\no<regrind> endrepeat\nM2\n";
+        let text = "G21 G90 G94 G61\no<regrind> repeat [3]\nG1 X1 F60\no<regrind> endrepeat\nM2\n";
         let (mut program, mut steps) = (Program::new("p", text.to_owned()), VecDeque::new());
         program.read_on(&mut steps);
         assert_eq!(steps.len(), 4);

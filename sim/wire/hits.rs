@@ -11,7 +11,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 use tokio::time::sleep;
 
-use super::pty::Pty;
+use super::pty;
 use super::tcp::next_client;
 use crate::hits::PartProgram;
 
@@ -41,15 +41,14 @@ impl ServingHits {
     /// # Errors
     /// Returns an error if no pseudo-terminal is available.
     pub fn serial() -> io::Result<Self> {
-        let pty = Pty::open()?;
-        let path = Some(pty.path().to_owned());
+        let (pty, path) = pty::open()?;
         let (lines, mut inbox) = mpsc::channel(64);
         let mut tasks = JoinSet::new();
         tasks.spawn(async move {
             // A line that hangs up is closed for good.
             let _ = print(pty, &mut inbox).await;
         });
-        Ok(Self { path, local_addr: None, lines, tasks })
+        Ok(Self { path: Some(path), local_addr: None, lines, tasks })
     }
 
     /// Creates a printer of hits (one text line for each touch of the probe) on a TCP server at the address `addr`.

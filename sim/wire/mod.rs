@@ -100,9 +100,9 @@ impl Serving {
         line: rtu::Line,
         faults: SharedFaultPlan,
     ) -> io::Result<Self> {
-        let port = pty::Pty::open()?;
+        let (port, path) = pty::open()?;
         let mut serving = Self::new(units, faults);
-        serving.path = Some(port.path().to_path_buf());
+        serving.path = Some(path);
         let (machines, faults) = (serving.machines.clone(), serving.faults.clone());
         serving.tasks.spawn(async move {
             // A pseudo-terminal fails only when it is closed for good.

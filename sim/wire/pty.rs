@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 
-use rustix::fs::{Mode, OFlags, open};
+use rustix::fs::{Mode, OFlags};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, ioctl_tiocnxcl, tcgetattr, tcsetattr};
 use tokio::io::unix::AsyncFd;
@@ -20,38 +20,30 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 pub struct Pty {
     near: AsyncFd<OwnedFd>,
     far: OwnedFd,
-    path: PathBuf,
 }
 
-impl Pty {
-    /// Opens a pseudo-terminal in raw mode. In this mode, the operating system passes all bytes unchanged.
-    ///
-    /// # Errors
-    /// No pseudo-terminal is available.
-    ///
-    /// # Panics
-    /// Panics outside of a tokio runtime.
-    pub fn open() -> io::Result<Self> {
-        let near = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY)?;
-        grantpt(&near)?;
-        unlockpt(&near)?;
-        let path = PathBuf::from(std::ffi::OsString::from_vec(ptsname(&near, Vec::new())?.into_bytes()));
-        let far = open(&path, OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty())?;
-        let mut settings = tcgetattr(&far)?;
-        settings.make_raw();
-        tcsetattr(&far, OptionalActions::Now, &settings)?;
-        rustix::io::ioctl_fionbio(&near, true)?;
-        // The successor of this function is unsafe because others could close the descriptor; this one is owned only
-        // here.
-        #[allow(deprecated)]
-        let near = AsyncFd::new(near)?;
-        Ok(Self { near, far, path })
-    }
-
-    /// Returns the path of the pseudo-terminal that a client opens.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
+/// Opens a pseudo-terminal in raw mode. In this mode, the operating system passes all bytes unchanged. Returns its near
+/// end, and the path that a client opens.
+///
+/// # Errors
+/// No pseudo-terminal is available.
+///
+/// # Panics
+/// Panics outside of a tokio runtime.
+pub fn open() -> io::Result<(Pty, PathBuf)> {
+    let near = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY)?;
+    grantpt(&near)?;
+    unlockpt(&near)?;
+    let path = PathBuf::from(std::ffi::OsString::from_vec(ptsname(&near, Vec::new())?.into_bytes()));
+    let far = rustix::fs::open(&path, OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty())?;
+    let mut settings = tcgetattr(&far)?;
+    settings.make_raw();
+    tcsetattr(&far, OptionalActions::Now, &settings)?;
+    rustix::io::ioctl_fionbio(&near, true)?;
+    // The successor of this function is unsafe because others could close the descriptor; this one is owned only here.
+    #[allow(deprecated)]
+    let near = AsyncFd::new(near)?;
+    Ok((Pty { near, far }, path))
 }
 
 /// Creates a symbolic link at the path `at`. The link points to the pseudo-terminal at the path `terminal`. Returns an

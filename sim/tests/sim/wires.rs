@@ -13,7 +13,7 @@ use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::wire::Serving;
 use regrind_sim::wire::faults::{Fault, FaultPlan, SharedFaultPlan, When};
 #[cfg(unix)]
-use regrind_sim::wire::pty::Pty;
+use regrind_sim::wire::pty;
 use regrind_sim::wire::rtu::Line;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -540,10 +540,10 @@ async fn rtu_wire_faults_alter_reply() {
 #[cfg(unix)]
 #[tokio::test]
 async fn pty_is_transparent_and_persistent() {
-    let mut pty = Pty::open().unwrap();
+    let (mut pty, path) = pty::open().unwrap();
     let every: Vec<u8> = (0..=255).collect();
     for _ in 0..3 {
-        let path = pty.path().to_str().unwrap();
+        let path = path.to_str().unwrap();
         let mut client = tokio_serial::SerialStream::open(&tokio_serial::new(path, 9600)).unwrap();
         client.write_all(&every).await.unwrap();
         assert_eq!(reply(&mut pty, 256).await, every);
