@@ -22,22 +22,6 @@ pub enum State {
     Faulted = 10,
 }
 
-impl State {
-    /// All states, in the order of their numbers.
-    pub const ALL: [Self; 10] = [
-        Self::Idle,
-        Self::Prepared,
-        Self::Execute,
-        Self::Holding,
-        Self::Held,
-        Self::Stopping,
-        Self::Complete,
-        Self::Aborting,
-        Self::Aborted,
-        Self::Faulted,
-    ];
-}
-
 /// Commands of docs/modbus.md.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 #[allow(missing_docs)]

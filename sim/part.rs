@@ -463,13 +463,6 @@ impl Part {
         (h + over, [slope[0] + by[0], slope[1] + by[1]])
     }
 
-    /// Returns the point of the real surface over the nominal position (x, y), and the unit normal of the real surface
-    /// at that point.
-    pub fn surface(&self, x: f64, y: f64) -> (Vec3, Vec3) {
-        let (point, tx, ty) = self.tangents(x, y, self.nearest_track(y));
-        (point, unit_normal(tx, ty))
-    }
-
     /// Returns the point of the real surface at the nominal position (x, y) in mm, and the derivatives of this point
     /// with respect to x and to y. Uses the groove of track number `track`, also at positions beyond the borders of
     /// this groove.
@@ -685,6 +678,11 @@ pub fn touch_sphere(centre_mm: Vec3, sphere_radius_mm: f64, way: &Approach) -> C
 mod tests {
     use super::*;
 
+    /// Returns the point of the real surface over the nominal position.
+    fn surface(part: &Part, [x, y]: [f64; 2]) -> Vec3 {
+        part.tangents(x, y, part.nearest_track(y)).0
+    }
+
     fn rough_part() -> Part {
         Part::blank(&PartSpec { stock_um: 120.0, form_error_correlation_mm: 6.0, ..PartSpec::default() }, 11)
     }
@@ -703,7 +701,7 @@ mod tests {
             for i in -20..=20 {
                 for j in -20..=20 {
                     let at = [about[0] + half * f64::from(i) / 20.0, about[1] + half * f64::from(j) / 20.0];
-                    let r = part.surface(at[0], at[1]).0;
+                    let r = surface(&part, at);
                     let d = (0..3).map(|k| (r[k] - c[k]).powi(2)).sum::<f64>().sqrt();
                     if d < best {
                         (best, middle) = (d, at);
@@ -791,7 +789,7 @@ mod tests {
                 };
                 // Search of the neighbourhood: no point is nearer than the radius, and the contact is at the radius.
                 let distance = |[x, y]: [f64; 2]| {
-                    let r = part.surface(x, y).0;
+                    let r = surface(&part, [x, y]);
                     (0..3).map(|i| (r[i] - c[i]).powi(2)).sum::<f64>().sqrt()
                 };
                 assert!(

@@ -4,8 +4,7 @@
 //! The machines receive plan, map and pass, and send points and pass record, as bytes with the high word first.
 //!
 //! Received bytes are not trusted: format, length, count, reserved zeros, finite numbers and declared extremes are
-//! checked before memory of that size is allocated. A fault gives a [`Refusal`] in words. [`Plan::encode`] and the
-//! other functions of the opposite direction exist so that a test can act as the client.
+//! checked before memory of that size is allocated. A fault gives a [`Refusal`] in words.
 
 use crate::Vec3;
 use crate::body::Refusal;
@@ -277,25 +276,6 @@ impl Plan {
         let targets = (0..count).map(|_| Target::decode(&mut reader)).collect::<Result<_, _>>()?;
         Ok(Self { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful, targets })
     }
-
-    /// Returns the measuring plan as the bytes of a payload of kind 1 in docs/modbus.md, high word first.
-    pub fn encode(&self) -> Vec<u8> {
-        let mut bytes = vec![0, 1, 0, 0];
-        bytes.extend((self.targets.len() as u32).to_be_bytes());
-        let header = [self.probe_radius_mm, self.approach_mm, self.search_mm, self.speed_mm_s, self.safe_height_mm];
-        push(&mut bytes, &header);
-        bytes.extend(self.careful.0.to_be_bytes());
-        bytes.extend([0; 4]);
-        push(&mut bytes, &[self.careful.1]);
-        for target in &self.targets {
-            bytes.extend(target.index.to_be_bytes());
-            bytes.extend((target.feature as u16).to_be_bytes());
-            bytes.extend([0; 2]);
-            push(&mut bytes, &target.point_mm);
-            push(&mut bytes, &target.normal);
-        }
-        bytes
-    }
 }
 
 impl Map {
@@ -335,21 +315,6 @@ impl Map {
             return Err(broken(format!("largest value is {} mm, the header says {max_mm}", map.max_abs_mm())));
         }
         Ok(map)
-    }
-
-    /// Returns the correction map as the bytes of a payload of kind 2 in docs/modbus.md, high word first.
-    pub fn encode(&self) -> Vec<u8> {
-        let mut bytes = vec![0, 1, 0, 1];
-        bytes.extend(self.columns.to_be_bytes());
-        bytes.extend(self.rows.to_be_bytes());
-        bytes.extend([0; 4]);
-        push(&mut bytes, &self.first_mm);
-        push(&mut bytes, &self.spacing_mm);
-        push(&mut bytes, &[self.max_abs_mm()]);
-        bytes.extend([0; 8]);
-        bytes.extend(self.nominal);
-        push(&mut bytes, &self.values_mm);
-        bytes
     }
 
     /// Returns the largest absolute value of all nodes, in mm.
@@ -409,20 +374,6 @@ impl Pass {
         }
         Err(broken(format!("the part's extent is x {x0} to {x1}, y {y0} to {y1} mm")))
     }
-
-    /// Returns the settings of the pass as the bytes of a payload of kind 3 in docs/modbus.md, high word first.
-    pub fn encode(&self) -> Vec<u8> {
-        let mut bytes = vec![0, 1];
-        bytes.extend(self.spark_out.to_be_bytes());
-        bytes.extend([0; 4]);
-        let header =
-            [self.wheel_radius_mm, self.feed_mm_min, self.track_spacing_mm, self.level_mm, self.depth_of_cut_mm];
-        push(&mut bytes, &header);
-        push(&mut bytes, &self.extent_mm);
-        bytes.extend([0; 16]);
-        bytes.extend(self.nominal);
-        bytes
-    }
 }
 
 /// Returns the measured points as bytes, high word first (kind 4 in docs/modbus.md). If `scale_mm` is `None`, a
@@ -445,41 +396,6 @@ pub fn encode_points(records: &[PointRecord], scale_mm: Option<f64>) -> Vec<u8> 
     bytes
 }
 
-/// Decodes measured points from bytes, for tests and for queries of the simulated truth. `scale_mm` must be the value
-/// with which the points were encoded: `None` for float coordinates, otherwise the step of the whole-number coordinates
-/// in mm.
-///
-/// # Errors
-/// Returns a refusal if the length is not a multiple of the length of a record, or if a value is invalid.
-pub fn decode_points(bytes: &[u8], scale_mm: Option<f64>) -> Result<Vec<PointRecord>, Refusal> {
-    let size = if scale_mm.is_some() { 20 } else { 32 };
-    exact(bytes, 0, (bytes.len() / size) as u64, size as u64)?;
-    let mut reader = Reader { rest: bytes };
-    (0..bytes.len() / size).map(|_| point(&mut reader, scale_mm)).collect()
-}
-
-fn point(reader: &mut Reader, scale_mm: Option<f64>) -> Result<PointRecord, Refusal> {
-    let index = reader.u32()?;
-    let status = match reader.u16()? {
-        1 => Status::Touched,
-        2 => Status::NotFound,
-        3 => Status::NotReached,
-        other => return Err(broken(format!("status of record {index} is {other}"))),
-    };
-    let quality = reader.u16()?;
-    let position_mm = match scale_mm {
-        None => reader.vector("position")?,
-        Some(scale) => {
-            let mut position = [0.0; 3];
-            for c in &mut position {
-                *c = scale * f64::from(i32::from_be_bytes(reader.read_bytes()?));
-            }
-            position
-        }
-    };
-    Ok(PointRecord { index, status, quality, position_mm })
-}
-
 impl PassRecord {
     /// Returns the pass record (the result of a grinding pass) as bytes, high word first: one record of kind 5 in
     /// docs/modbus.md.
@@ -499,18 +415,6 @@ impl PassRecord {
         ];
         push(&mut bytes, &figures);
         bytes
-    }
-
-    /// Decodes a pass record, for tests.
-    ///
-    /// # Errors
-    /// The bytes are not a pass record.
-    pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
-        exact(bytes, 64, 0, 0)?;
-        let mut reader = Reader { rest: bytes };
-        let (job, cycle, result) = (reader.u32()?, reader.u16()?, reader.u16()?);
-        let [path_mm, volume_mm3, depth_mm, air_share, spindle_load, wheel_radius_mm, _] = reader.vector("figures")?;
-        Ok(Self { job, cycle, result, path_mm, volume_mm3, depth_mm, air_share, spindle_load, wheel_radius_mm })
     }
 }
 

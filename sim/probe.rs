@@ -116,24 +116,6 @@ pub fn add_noise(rng: &mut Rng, points: &mut [Vec3], sigma_mm: f64) {
     }
 }
 
-/// Changes some of the points into outliers. Selects each point with the probability `share`, from 0 to 1, and moves it
-/// in a random direction. The distance is uniform from `min_mm` to `max_mm`, in mm; `min_mm` must be less than
-/// `max_mm`. Returns the indices of the moved points, in ascending order.
-pub fn add_outliers(rng: &mut Rng, points: &mut [Vec3], share: f64, min_mm: f64, max_mm: f64) -> Vec<usize> {
-    let mut moved = Vec::new();
-    for (index, point) in points.iter_mut().enumerate() {
-        if rng.random::<f64>() < share {
-            let direction = unit::<3>(rng);
-            let by = rng.random_range(min_mm..max_mm);
-            for (c, d) in point.iter_mut().zip(direction) {
-                *c += by * d;
-            }
-            moved.push(index);
-        }
-    }
-    moved
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

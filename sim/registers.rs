@@ -11,7 +11,7 @@ use crate::command::{Mode, State};
 use crate::event_log::{HandshakeEvent, LogEntry, Observer};
 use crate::handshake::Handshake;
 use crate::options::{Block, MachineOptions, RegisterLayout};
-use crate::register_encoding::{RegisterBlock, WordOrder};
+use crate::register_encoding::RegisterBlock;
 use crate::transfer::{Inbox, page_image, slots_image};
 
 /// Modbus exception code of a refused request.
@@ -327,11 +327,6 @@ impl SimulatedMachine {
         &self.options.layout
     }
 
-    /// Returns the word order of the machine.
-    pub fn word_order(&self) -> WordOrder {
-        self.options.word_order
-    }
-
     /// Returns the events in the log, the oldest first. When the log is full, the older half of the events is removed;
     /// [`Self::forgotten`] counts the removed events.
     pub fn log(&self) -> &[LogEntry] {
@@ -356,12 +351,6 @@ impl SimulatedMachine {
             _ => None,
         };
         self.log().iter().filter_map(began).collect()
-    }
-
-    /// Returns the simulated physics of the machine. A test can change the physics directly in this way, without a
-    /// command to the machine.
-    pub fn body_mut(&mut self) -> &mut dyn Physics {
-        &mut *self.handshake.body
     }
 
     /// Sets the number of simulated seconds in a real second.

@@ -14,10 +14,10 @@ use std::sync::{Arc, Mutex};
 use crate::cmm::{Cmm, TouchProbe};
 use crate::executed_wheel::Wheel;
 use crate::grinder::Grinder;
-use crate::part::{Approach, Contact};
+use crate::part::Part;
 use crate::probe::Placement;
 use crate::removal::systematic_mm;
-use crate::spec::{SpecError, WorldFaults, WorldSpec};
+use crate::spec::{SpecError, WorldSpec};
 use crate::truth::{ExecutedPass, GrindEntry, WorldState, locked};
 
 /// Simulated cell. Clones share one truth.
@@ -79,14 +79,6 @@ impl World {
         locked(&self.state).load_blank();
     }
 
-    /// Sets the simulated faults, from the next job on. The next measurement loads the part again, with a new random
-    /// error of its placement.
-    pub fn set_faults(&self, faults: WorldFaults) {
-        let mut state = locked(&self.state);
-        state.spec.faults = faults;
-        state.on_table = false;
-    }
-
     /// Returns the specification of this world.
     pub fn spec(&self) -> WorldSpec {
         locked(&self.state).spec.clone()
@@ -107,26 +99,10 @@ impl World {
         places_mm.iter().map(|&[x, y]| state.part.deviation_mm(x, y)).collect()
     }
 
-    /// Returns a true ball height in mm for each position (x, y) in `places_mm`, in the model frame. A ball of radius
-    /// `radius_mm` moves along the normal of the nominal surface at (x, y) until it touches the real surface. The
-    /// height is the distance of its centre from the nominal surface along this normal, minus the radius.
-    ///
-    /// In a groove, this height differs from [`Self::deviation_mm`], because the ball touches the surface beside the
-    /// normal.
-    ///
-    /// A value is `None` if the contact is beyond the part, or if the height is not between -1 mm and 1 mm.
-    pub fn ball_heights_mm(&self, places_mm: &[[f64; 2]], radius_mm: f64) -> Vec<Option<f64>> {
-        const REACH_MM: f64 = 1.0;
-        let state = locked(&self.state);
-        let (part, shape) = (&state.part, &state.part.shape);
-        let height_mm = |&[x, y]: &[f64; 2]| {
-            let (point_mm, direction) = (shape.point(x, y), shape.normal(x, y));
-            let way =
-                Approach { point_mm, direction, radius_mm, from_mm: radius_mm + REACH_MM, to_mm: radius_mm - REACH_MM };
-            let Contact::Touched { centre_mm, .. } = part.touch(&way) else { return None };
-            Some((0..3).map(|i| (centre_mm[i] - point_mm[i]) * direction[i]).sum::<f64>() - radius_mm)
-        };
-        places_mm.iter().map(height_mm).collect()
+    /// Calls the function `look` with the true part, and returns the result of `look`. The part cannot be ground during
+    /// this call.
+    pub fn with_part<T>(&self, look: impl FnOnce(&Part) -> T) -> T {
+        look(&locked(&self.state).part)
     }
 
     /// Returns a point of the nominal surface in mm, and the unit normal at this point. The point has the coordinates
@@ -141,28 +117,6 @@ impl World {
     /// the placement has no random error of loading.
     pub fn placement(&self) -> Placement {
         locked(&self.state).placement
-    }
-
-    /// Returns the true deviation of the real surface from the nominal surface, averaged over the part, in mm. The
-    /// ridges between the grinder's tracks are included.
-    pub fn level_mm(&self) -> f64 {
-        let state = locked(&self.state);
-        let part = &state.part;
-        let on_part: Vec<f64> = part
-            .height
-            .nodes()
-            .zip(&part.height.heights_mm)
-            .filter(|([x, y], _)| part.aperture.contains(*x, *y))
-            // The mean of a parabola is a third of its height.
-            .map(|([x, y], h)| h + part.ridge_mm(x, y) / 3.0)
-            .collect();
-        on_part.iter().sum::<f64>() / on_part.len() as f64
-    }
-
-    /// Returns the RMS of the random height error that the grinder adds in each pass, in mm. This is the value
-    /// `repeatability_um` of the specification. The error differs in each pass, so no compensation can remove it.
-    pub fn repeatability_mm(&self) -> f64 {
-        locked(&self.state).spec.grinder.repeatability_um * 1e-3
     }
 
     /// Returns one entry for each pass that [`World::grinder`] has begun, in order of time. A running pass is included.

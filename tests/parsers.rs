@@ -20,6 +20,8 @@ use serde_json::json;
 #[path = "../fuzz/parsers.rs"]
 mod parsers;
 
+use parsers::payloads::Encode;
+
 #[global_allocator]
 static MEMORY: PeakAlloc = PeakAlloc;
 

@@ -32,12 +32,6 @@ impl Line {
         Self { baud, paced: true }
     }
 
-    /// Returns a line that adds no transmission time to a frame. It is meant for a real serial port, which needs this
-    /// time itself. `baud` is the speed in bit/s; the silence between two frames still depends on it.
-    pub fn unpaced(baud: u32) -> Self {
-        Self { baud, paced: false }
-    }
-
     /// Returns the transmission time of `count` characters of 11 bits.
     pub fn characters(&self, count: usize) -> Duration {
         Duration::from_secs_f64(11.0 * count as f64 / f64::from(self.baud.max(1)))

@@ -8,6 +8,8 @@ mod ippdme;
 #[path = "../common/keep.rs"]
 mod keep;
 mod modbus;
+#[path = "../common/perfect.rs"]
+mod perfect;
 #[path = "../common/program.rs"]
 mod program;
 mod read_ahead;

@@ -794,7 +794,7 @@ pub fn rtu(
 async fn two_machines_share_a_serial_line() {
     let options = MachineOptions::default;
     let units = vec![(1, toy(Kind::Cmm, AT_ONCE, options())), (2, toy(Kind::Grinder, AT_ONCE, options()))];
-    let (_serving, settings) = rtu(units, SerialLine::unpaced(115_200), SharedFaultPlan::none());
+    let (_serving, settings) = rtu(units, SerialLine { baud: 115_200, paced: false }, SharedFaultPlan::none());
     let settings = patient(settings);
     let link = Link::new(settings.line.clone(), settings.request_timeout, settings.quarantine).unwrap();
     let mut cmm = ModbusCmm::on(link.clone(), settings.clone());
@@ -818,7 +818,7 @@ async fn rtu_wire_faults_give_exact_points() {
     for fault in faults {
         let rules = FaultPlan::new(5).always(When::Every(23), fault.clone());
         let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
-        let (serving, settings) = rtu(vec![(1, machine)], SerialLine::unpaced(115_200), rules.into());
+        let (serving, settings) = rtu(vec![(1, machine)], SerialLine { baud: 115_200, paced: false }, rules.into());
         let mut cmm = ModbusCmm::new(settings).unwrap();
         let hint = format!("{fault:?}");
         cmm.connect().await.unwrap_or_else(|error| panic!("{hint}: {error}"));
@@ -838,7 +838,7 @@ async fn late_reply_not_matched_to_next_request() {
         Fault::DelayReply(Duration::from_millis(900)),
     );
     let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
-    let (serving, settings) = rtu(vec![(1, machine)], SerialLine::unpaced(115_200), rules.into());
+    let (serving, settings) = rtu(vec![(1, machine)], SerialLine { baud: 115_200, paced: false }, rules.into());
     let mut cmm = connected(settings).await;
     assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "late");
     assert_eq!((serving.faults().fired().len(), began(&serving).len()), (4, 1));

@@ -320,7 +320,7 @@ async fn read_ahead_off_on_slow_line() {
     let plan = plan(40);
     for (baud, told) in [(19_200, 0), (38_400, 2)] {
         let (serving, settings) =
-            rtu(vec![(1, machine(toy(), true))], SerialLine::unpaced(baud), SharedFaultPlan::none());
+            rtu(vec![(1, machine(toy(), true))], SerialLine { baud, paced: false }, SharedFaultPlan::none());
         let mut cmm = begin_job(patient(settings), &plan).await;
         work(&serving, 20);
         assert_eq!(poll(&mut cmm, &plan, 1, 4).await.len(), told, "{baud}");

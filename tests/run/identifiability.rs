@@ -1,5 +1,6 @@
 //! Machine parameters in many worlds: estimated, compensated, and compared with the map alone, by the truth.
 
+use crate::perfect::perfect_grinder;
 use regrind::compensation::path::nominal_height_field;
 use regrind::compensation::{GainRule, ParameterKind, SurfacePoint, WheelTerm};
 use regrind::drive::ParameterCompensation;
@@ -117,7 +118,7 @@ impl Bench {
             repeatability_um: of.repeatability_um,
             repeatability_correlation_mm: of.repeatability_correlation_mm,
             error_copying: of.error_copying,
-            ..GrinderSpec::perfect()
+            ..perfect_grinder()
         };
         let twin = WorldSpec { grinder: alone, ..spec.clone() };
         let still =
@@ -152,7 +153,7 @@ impl Bench {
             break_in_um: of.break_in_um,
             thermal_um: of.thermal_um,
             error_copying: of.error_copying,
-            ..GrinderSpec::perfect()
+            ..perfect_grinder()
         };
         let world = World::new(WorldSpec { grinder: alone, ..spec.clone() }).unwrap();
         let mut line = Line::new(self, Way::Regrind(GainRule::Wavelength), &world, &world, None, 1);

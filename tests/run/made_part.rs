@@ -1,6 +1,7 @@
 //! Whole parts, ground and measured until they are accepted: with the whole pattern, or with touches that are chosen
 //! batch by batch.
 
+use crate::client_payloads::Encode;
 use regrind::cell::PvPoints;
 use regrind::compensation::map_from_model;
 use regrind::drive::AdaptiveOptions;

@@ -8,6 +8,8 @@ mod apart;
 mod audit;
 mod bad_cells;
 mod careful;
+#[path = "../common/payloads.rs"]
+mod client_payloads;
 mod contents;
 mod convergence;
 mod cycles;
@@ -41,6 +43,8 @@ mod outlived;
 mod outside;
 mod panics;
 mod parameters;
+#[path = "../common/perfect.rs"]
+mod perfect;
 mod prepared;
 mod production;
 #[path = "../common/program.rs"]

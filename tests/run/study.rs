@@ -11,6 +11,8 @@ pub mod transfer;
 
 use std::path::Path;
 
+use crate::client_payloads::{Encode, decode_points};
+use crate::perfect::perfect_grinder;
 use regrind::cell::CellPlan;
 use regrind::compensation::{
     Correction, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, ParameterCorrections,
@@ -25,7 +27,7 @@ use regrind::registration::{Deviation, PointStatus, Registration};
 use regrind::setup;
 use regrind_sim::body::{Payload, Payloads, Physics};
 use regrind_sim::grinder::Grinder;
-use regrind_sim::payload::{Feature, Map, Pass, Plan, PointRecord, Status, Target, decode_points};
+use regrind_sim::payload::{Feature, Map, Pass, Plan, PointRecord, Status, Target};
 use regrind_sim::spec::GrinderSpec;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
@@ -105,7 +107,7 @@ fn random_alone(spec: &WorldSpec) -> WorldSpec {
         repeatability_um: spec.grinder.repeatability_um,
         repeatability_correlation_mm: spec.grinder.repeatability_correlation_mm,
         error_copying: spec.grinder.error_copying,
-        ..GrinderSpec::perfect()
+        ..perfect_grinder()
     };
     WorldSpec { grinder, ..spec.clone() }
 }

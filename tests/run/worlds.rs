@@ -20,6 +20,7 @@ use regrind::setup;
 use regrind_sim::Vec3;
 use regrind_sim::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
 use regrind_sim::options::MachineOptions;
+use regrind_sim::part::{Approach, Contact, Part};
 use regrind_sim::probe::Placement;
 use regrind_sim::register_encoding;
 use regrind_sim::registers::SimulatedMachine;
@@ -222,12 +223,30 @@ impl WorldRecorder {
         let centres = measured.iter().map(|row| back(&placement, [row[0], row[1], row[2]]));
         let places_mm: Vec<[f64; 2]> = centres.map(|centre| project_onto_nominal(world, centre).0).collect();
         // A touch at the very edge of the part may have its projection beyond the edge.
-        let touched = world.ball_heights_mm(&places_mm, *radius_mm);
+        let touched = ball_heights_mm(world, &places_mm, *radius_mm);
         let without_ball = touched.iter().map(Option::is_none).collect();
         let touched = touched.into_iter().zip(&places_mm);
         let heights_mm = touched.map(|(height, &[x, y])| height.unwrap_or_else(|| world.deviation_mm(x, y))).collect();
         taken.push(Snapshot { cycle, placement, places_mm, heights_mm, without_ball });
     }
+}
+
+/// Returns a true ball height in mm for each position (x, y) in `places_mm`, in the model frame. A ball of radius
+/// `radius_mm` moves along the normal of the nominal surface at (x, y) until it touches the real surface. The height is
+/// the distance of its centre from the nominal surface along this normal, minus the radius. In a groove, this height
+/// differs from the deviation, because the ball touches the surface beside the normal.
+///
+/// A value is `None` if the contact is beyond the part, or if the height is not between -1 mm and 1 mm.
+fn ball_heights_mm(world: &World, places_mm: &[[f64; 2]], radius_mm: f64) -> Vec<Option<f64>> {
+    const REACH_MM: f64 = 1.0;
+    let height_mm = |part: &Part, &[x, y]: &[f64; 2]| {
+        let (point_mm, direction) = (part.shape.point(x, y), part.shape.normal(x, y));
+        let way =
+            Approach { point_mm, direction, radius_mm, from_mm: radius_mm + REACH_MM, to_mm: radius_mm - REACH_MM };
+        let Contact::Touched { centre_mm, .. } = part.touch(&way) else { return None };
+        Some((0..3).map(|i| (centre_mm[i] - point_mm[i]) * direction[i]).sum::<f64>() - radius_mm)
+    };
+    world.with_part(|part| places_mm.iter().map(|place| height_mm(part, place)).collect())
 }
 
 /// Transforms a point from the CMM's frame to the part's frame.

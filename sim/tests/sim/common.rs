@@ -1,12 +1,12 @@
 //! A client in a few lines: payloads, whole jobs, and what is left of a deviation when the part may be moved.
 #![allow(dead_code)]
 
+use crate::client_payloads::{Encode, decode_pass_record, decode_points};
+use crate::perfect::{perfect_cmm, perfect_grinder};
 use regrind_sim::body::{Payload, Payloads, Physics, ResultData};
 use regrind_sim::grinder::Grinder;
 use regrind_sim::part::{Aperture, PartSpec, ShapeSpec};
-use regrind_sim::payload::{Feature, Map, Pass, PassRecord, Plan, PointRecord, Target, decode_points};
-use regrind_sim::spec::CmmSpec;
-use regrind_sim::spec::GrinderSpec;
+use regrind_sim::payload::{Feature, Map, Pass, PassRecord, Plan, PointRecord, Target};
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
 
@@ -22,8 +22,8 @@ pub fn small_perfect() -> WorldSpec {
             form_error_um: 0.0,
             ..PartSpec::default()
         },
-        grinder: GrinderSpec::perfect(),
-        cmm: CmmSpec::perfect(),
+        grinder: perfect_grinder(),
+        cmm: perfect_cmm(),
         ..WorldSpec::default()
     }
 }
@@ -81,7 +81,7 @@ pub fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass
     grinder.prepare(job, cycle, &grinder_payloads(map, pass)).unwrap();
     grinder.begin();
     run(grinder, 7.0);
-    PassRecord::decode(&grinder.end_job(1).bytes).unwrap()
+    decode_pass_record(&grinder.end_job(1).bytes).unwrap()
 }
 
 /// A plan for places over the nominal surface of a world, touched along the normals.
@@ -163,6 +163,17 @@ fn eliminate(mut a: [[f64; 7]; 6]) -> [f64; 6] {
         *value = a[k][6];
     }
     solution
+}
+
+/// Returns the true deviation of the real surface from the nominal surface, averaged over the part, in mm. The ridges
+/// between the grinder's tracks are included.
+pub fn level_mm(world: &World) -> f64 {
+    world.with_part(|part| {
+        let nodes: Vec<[f64; 2]> = part.height.nodes().filter(|[x, y]| part.aperture.contains(*x, *y)).collect();
+        // The mean of a parabola is a third of its height.
+        let heights = nodes.iter().map(|&[x, y]| part.height.at(x, y).0 + part.ridge_mm(x, y) / 3.0);
+        heights.sum::<f64>() / nodes.len() as f64
+    })
 }
 
 /// Peak to valley and root of the mean square, in micrometres.

@@ -1,7 +1,7 @@
 //! The wheel along a path that somebody else executes, against what can be worked out by hand and against the grinder
 //! that makes its own.
 
-use crate::common::{grind, net, pass, small_perfect, zero_map};
+use crate::common::{grind, level_mm, net, pass, small_perfect, zero_map};
 use regrind_sim::cmm::TouchResult;
 use regrind_sim::spec::{GrinderSpec, WorldSpec};
 use regrind_sim::world::World;
@@ -113,7 +113,7 @@ fn executed_path_matches_simulated_pass() {
     let off: Vec<f64> = a.iter().zip(&b).map(|(a, b)| a - b).collect();
     let (most, mean) = (off.iter().fold(0.0, |m: f64, d| m.max(d.abs())), off.iter().sum::<f64>() / off.len() as f64);
     assert!(most < 3.1e-3 && mean.abs() < 0.3e-3, "off by {most} at most, {mean} mm in the mean");
-    assert!((along.level_mm() - own.level_mm()).abs() < 0.2e-3);
+    assert!((level_mm(&along) - level_mm(&own)).abs() < 0.2e-3);
 }
 
 #[test]

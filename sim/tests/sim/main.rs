@@ -1,12 +1,17 @@
 //! The simulated machines: what they do to a part, and what stands on their wires.
 
+#[path = "../../../tests/common/payloads.rs"]
+mod client_payloads;
 mod closing_the_loop;
 mod common;
 mod counter;
+mod desk;
 mod executed;
 mod grinding;
 mod machines;
 mod measuring;
 mod payloads;
+#[path = "../../../tests/common/perfect.rs"]
+mod perfect;
 mod registers;
 mod wires;

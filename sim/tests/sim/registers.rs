@@ -3,59 +3,38 @@
 use std::time::Duration;
 
 use crate::counter::{Counter, digest, payloads};
+use crate::desk::Desk;
 use regrind_sim::body::Kind;
 use regrind_sim::command::{Answer, Command, CommandFrame, Mode, State, interlock};
 use regrind_sim::event_log::{BeatStatistics, HandshakeEvent};
 use regrind_sim::options::{MachineOptions, RegisterLayout};
 use regrind_sim::register_encoding::{WordOrder, bytes_of, registers_of, turn_payload};
-use regrind_sim::registers::{Exception, SimulatedMachine};
+use regrind_sim::registers::Exception;
 
 const MS: Duration = Duration::from_millis(1);
 const S: Duration = Duration::from_secs(1);
 
-/// A client at a machine's registers.
-struct Desk {
-    machine: SimulatedMachine,
-    order: WordOrder,
-    kind: Kind,
-    sequence: u32,
-    owner: u32,
-    epoch: u32,
-    beat: u16,
-}
+/// All states, in the order of their numbers.
+const ALL_STATES: [State; 10] = [
+    State::Idle,
+    State::Prepared,
+    State::Execute,
+    State::Holding,
+    State::Held,
+    State::Stopping,
+    State::Complete,
+    State::Aborting,
+    State::Aborted,
+    State::Faulted,
+];
 
 /// Something that happens at a desk.
 type ClientAction = fn(&mut Desk);
 
-/// The status block, read.
-#[derive(Debug, PartialEq)]
-struct Status {
-    state: u16,
-    mode: u16,
-    interlocks: u16,
-    acknowledged: u32,
-    answer: u16,
-    fault: u16,
-    job: u32,
-    cycle: u16,
-    digest: u32,
-    token: u32,
-    done: u32,
-    result: u16,
-    progress: [u32; 2],
-    owner: u32,
-    epoch: u32,
-    last_begun: (u32, u16),
-    temperature: i16,
-    boot_id: u32,
-    begun_by: u32,
-}
-
 impl Desk {
     fn at(body: Counter, options: MachineOptions) -> Self {
-        let (order, kind) = (options.word_order, body.kind);
-        let machine = SimulatedMachine::new(Box::new(body), 77, options);
-        Self { machine, order, kind, sequence: 100, owner: 9, epoch: 1, beat: 0 }
+        let digest = digest(body.kind);
+        Self::with_body(body, options, digest)
     }
 
     fn new(kind: Kind) -> Self {
@@ -95,133 +74,6 @@ impl Desk {
                 self.send(kind, &bytes, identity);
             }
         }
-    }
-
-    fn read(&mut self, address: u16, count: u16) -> Vec<u16> {
-        self.machine.read(address, count).unwrap()
-    }
-
-    fn u32(&self, words: &[u16], at: usize) -> u32 {
-        self.order.to_u32([words[at], words[at + 1]])
-    }
-
-    fn status(&mut self) -> Status {
-        let w = self.read(64, 48);
-        assert_eq!(w[0], w[47]);
-        let long = |at: usize| self.u32(&w, at);
-        Status {
-            state: w[1],
-            mode: w[2],
-            interlocks: w[3],
-            acknowledged: long(4),
-            answer: w[6],
-            fault: w[7],
-            job: long(8),
-            cycle: w[10],
-            digest: long(12),
-            token: long(14),
-            done: long(16),
-            result: w[18],
-            progress: [long(20), long(22)],
-            owner: long(24),
-            epoch: long(26),
-            last_begun: (long(30), w[32]),
-            temperature: w[33] as i16,
-            boot_id: long(34),
-            begun_by: long(36),
-        }
-    }
-
-    /// The frame of a command as the client would fill it in now, with the next number.
-    fn frame(&mut self, command: Command) -> CommandFrame {
-        self.sequence += 1;
-        let status = self.status();
-        CommandFrame {
-            sequence: self.sequence,
-            command: command as u16,
-            cycle: 2,
-            owner: self.owner,
-            epoch: self.epoch,
-            job: 41,
-            digest: digest(self.kind),
-            token: status.token,
-            argument: status.done,
-        }
-    }
-
-    fn put(&mut self, frame: CommandFrame) -> u16 {
-        self.machine.write(40, &frame.registers(self.order)).unwrap();
-        self.status().answer
-    }
-
-    fn command(&mut self, command: Command) -> u16 {
-        let frame = self.frame(command);
-        let answer = self.put(frame);
-        assert_eq!(self.status().acknowledged, frame.sequence);
-        answer
-    }
-
-    fn accept(&mut self, command: Command) {
-        assert_eq!(self.command(command), Answer::Accepted as u16, "{command:?} in {:?}", self.machine.state());
-    }
-
-    fn header(&self, kind: u16, bytes: &[u8], crc: u32, identity: [u8; 32]) -> Vec<u16> {
-        let mut words = vec![kind, 0];
-        words.extend(self.order.from_u32(bytes.len() as u32));
-        words.extend(self.order.from_u32(crc));
-        words.extend([0, 0]);
-        words.extend(registers_of(&identity));
-        words
-    }
-
-    fn page(&self, page: u32, data: &[u16]) -> Vec<u16> {
-        let mut words = self.order.from_u32(page).to_vec();
-        words.extend([data.len() as u16, 0, 0, 0, 0, 0]);
-        words.extend(data);
-        words
-    }
-
-    fn send(&mut self, kind: u16, bytes: &[u8], identity: [u8; 32]) {
-        let header = self.header(kind, bytes, crc32fast::hash(bytes), identity);
-        self.machine.write(200, &header).unwrap();
-        for (page, data) in registers_of(bytes).chunks(112).enumerate() {
-            let page = self.page(page as u32, data);
-            self.machine.write(224, &page).unwrap();
-        }
-    }
-
-    /// Beats while time passes.
-    fn wait(&mut self, time: Duration) {
-        let mut left = time;
-        while !left.is_zero() {
-            let step = left.min(250 * MS);
-            left -= step;
-            self.beat = self.beat.wrapping_add(1);
-            self.write_beat(self.beat, self.owner);
-            self.machine.tick(step);
-        }
-    }
-
-    fn write_beat(&mut self, count: u16, owner: u32) {
-        let [first, second] = self.order.from_u32(owner);
-        self.machine.write(36, &[count, first, second]).unwrap();
-    }
-
-    fn outbox(&mut self) -> (Vec<u16>, Vec<u8>) {
-        let header = self.read(400, 56);
-        let length = self.u32(&header, 2) as usize;
-        let mut registers = Vec::new();
-        while registers.len() < length.div_ceil(2) {
-            let page = (registers.len() / 112) as u32;
-            self.machine.write(460, &self.order.from_u32(page)).unwrap();
-            let answer = self.read(462, 116);
-            assert_eq!(self.u32(&answer, 0), page);
-            registers.extend(&answer[4..4 + usize::from(answer[2])]);
-        }
-        let mut bytes = bytes_of(&registers);
-        bytes.truncate(length);
-        assert_eq!(crc32fast::hash(&bytes), self.u32(&header, 4));
-        (header, bytes)
     }
 
     /// Brings a fresh machine into a state, where it stays.
@@ -400,13 +252,13 @@ fn commands_answer_by_state_table() {
     use Command::*;
     use State::*;
     let allowed: [(Command, &[(State, State)]); 10] = [
-        (Claim, &State::ALL.map(|state| (state, state))),
+        (Claim, &ALL_STATES.map(|state| (state, state))),
         (Prepare, &[(Idle, Prepared)]),
         (Start, &[(Prepared, Execute)]),
         (Hold, &[(Execute, Holding)]),
         (Resume, &[(Held, Execute)]),
         (Stop, &[(Prepared, Idle), (Execute, Stopping), (Holding, Stopping), (Held, Stopping)]),
-        (Abort, &State::ALL.map(|state| (state, if state == Aborted { Aborted } else { Aborting }))),
+        (Abort, &ALL_STATES.map(|state| (state, if state == Aborted { Aborted } else { Aborting }))),
         (Clear, &[(Aborted, Idle), (Faulted, Idle)]),
         (Acknowledge, &[(Complete, Idle)]),
         (
@@ -416,7 +268,7 @@ fn commands_answer_by_state_table() {
         ),
     ];
     for (command, leads) in allowed {
-        for state in State::ALL {
+        for state in ALL_STATES {
             let mut desk = Desk::in_state(state);
             let answer = desk.command(command);
             let to = leads.iter().find(|(from, _)| *from == state).map(|(_, to)| *to);
@@ -430,7 +282,7 @@ fn commands_answer_by_state_table() {
 
 #[test]
 fn non_owner_may_only_abort() {
-    for state in State::ALL {
+    for state in ALL_STATES {
         for command in Command::ALL {
             for (owner, epoch) in [(8, 1), (9, 2), (9, 0)] {
                 let mut desk = Desk::in_state(state);
@@ -776,7 +628,7 @@ fn non_owner_heartbeat_ignored() {
 
 #[test]
 fn heartbeat_timeout_only_in_motion() {
-    for state in State::ALL.into_iter().filter(|s| *s != State::Execute && *s != State::Prepared) {
+    for state in ALL_STATES.into_iter().filter(|s| *s != State::Execute && *s != State::Prepared) {
         let mut desk = Desk::in_state(state);
         desk.machine.tick(9 * S / 2);
         assert_ne!(desk.status().fault, 20, "{state:?}");
@@ -914,7 +766,7 @@ fn inbox_refuses_bad_header() {
     let header = desk.header(1, &[0; 4], 0, [0; 32]);
     assert_eq!(desk.machine.write(200, &header[..23]), Err(Exception::Value), "a part of a header");
     assert_eq!(desk.machine.write(201, &header[1..]), Err(Exception::Value), "a part of a header");
-    for state in State::ALL {
+    for state in ALL_STATES {
         let mut desk = Desk::in_state(state);
         let header = desk.header(2, &[0; 4], 0, [0; 32]);
         let refused = matches!(state, State::Execute | State::Holding | State::Held);

@@ -132,7 +132,7 @@ async fn whole_job_over_tcp_two_units() {
 #[tokio::test]
 async fn whole_job_over_rtu_two_units() {
     let units = vec![(1, machine(Kind::Cmm)), (2, machine(Kind::Grinder))];
-    let serving = Serving::rtu(units, Line::unpaced(115_200), SharedFaultPlan::none()).unwrap();
+    let serving = Serving::rtu(units, Line { baud: 115_200, paced: false }, SharedFaultPlan::none()).unwrap();
     let port = tokio_serial::SerialStream::open(&tokio_serial::new(serving.path().unwrap().to_str().unwrap(), 115_200));
     let mut wire = client::rtu::attach_slave(port.unwrap(), Slave(1));
     assert_eq!(run_a_job(&mut wire, Kind::Cmm).await.len(), 620);
@@ -466,7 +466,7 @@ fn open(serving: &Serving) -> tokio_serial::SerialStream {
 #[tokio::test]
 async fn rtu_answers_only_own_units() {
     let units = vec![(1, machine(Kind::Cmm)), (2, machine(Kind::Grinder))];
-    let serving = Serving::rtu(units, Line::unpaced(115_200), SharedFaultPlan::none()).unwrap();
+    let serving = Serving::rtu(units, Line { baud: 115_200, paced: false }, SharedFaultPlan::none()).unwrap();
     let mut port = open(&serving);
     let answer = rtu_frame(1, &[3, 2, 0x52, 0x47]);
     for silent in [rtu_frame(9, &READ), rtu_frame(0, &READ), rtu_frame(0, &[16, 0, 36, 0, 1, 2, 0, 7])] {
@@ -484,7 +484,9 @@ async fn rtu_answers_only_own_units() {
 
 #[tokio::test]
 async fn rtu_resyncs_after_noise() {
-    let serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(115_200), SharedFaultPlan::none()).unwrap();
+    let serving =
+        Serving::rtu(vec![(1, machine(Kind::Cmm))], Line { baud: 115_200, paced: false }, SharedFaultPlan::none())
+            .unwrap();
     let mut port = open(&serving);
     let (ask, answer) = (rtu_frame(1, &READ), rtu_frame(1, &[3, 2, 0x52, 0x47]));
     let mut flipped = ask.clone();
@@ -528,7 +530,8 @@ async fn rtu_wire_faults_alter_reply() {
     ];
     for (fault, mut expected) in cases {
         let faults = SharedFaultPlan::from(FaultPlan::new(0).once(When::Any, fault.clone()));
-        let serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(115_200), faults).unwrap();
+        let serving =
+            Serving::rtu(vec![(1, machine(Kind::Cmm))], Line { baud: 115_200, paced: false }, faults).unwrap();
         let mut port = open(&serving);
         port.write_all(&rtu_frame(1, &READ)).await.unwrap();
         port.write_all(&rtu_frame(1, &READ)).await.unwrap();
@@ -560,7 +563,8 @@ async fn pty_symlink_at_cell_file_path() {
     // A link that an older simulator left behind is replaced; a file of somebody else is not.
     std::os::unix::fs::symlink("/dev/pts/none", &name).unwrap();
     let mut serving =
-        Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(9600), SharedFaultPlan::none()).unwrap();
+        Serving::rtu(vec![(1, machine(Kind::Cmm))], Line { baud: 9600, paced: false }, SharedFaultPlan::none())
+            .unwrap();
     serving.link(&name).unwrap();
     assert_eq!(serving.path(), Some(name.as_path()));
     let mut port = open(&serving);
@@ -570,7 +574,8 @@ async fn pty_symlink_at_cell_file_path() {
     assert!(std::fs::symlink_metadata(&name).is_err(), "the link goes with the line");
     std::fs::write(&name, "mine").unwrap();
     let mut serving =
-        Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(9600), SharedFaultPlan::none()).unwrap();
+        Serving::rtu(vec![(1, machine(Kind::Cmm))], Line { baud: 9600, paced: false }, SharedFaultPlan::none())
+            .unwrap();
     assert!(serving.link(&name).is_err());
     drop(serving);
     assert_eq!(std::fs::read_to_string(&name).unwrap(), "mine");

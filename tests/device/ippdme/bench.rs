@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use crate::perfect::perfect_cmm;
 use regrind::device::Interrupt;
 use regrind::device::ippdme::Limits;
 use regrind::device::{
@@ -69,7 +70,7 @@ impl Bench {
     }
 
     pub async fn with(speed: f64, limits: Limits, options: Options) -> Self {
-        Self::measuring(CmmSpec::perfect(), speed, limits, options).await
+        Self::measuring(perfect_cmm(), speed, limits, options).await
     }
 
     pub async fn measuring(cmm: CmmSpec, speed: f64, limits: Limits, options: Options) -> Self {

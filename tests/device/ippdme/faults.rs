@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use crate::perfect::perfect_cmm;
 use regrind::device::{
     Cmm, DeviceError, Fault as MachineFault, Interrupt, Machine, MachineState, Outcome, Reconciled, Status,
 };
@@ -189,7 +190,7 @@ async fn travel_limit_warning_faults() {
 
 #[tokio::test]
 async fn miss_needing_operator_not_retried() {
-    let spec = regrind_sim::spec::CmmSpec { not_found_share: 1.0, ..regrind_sim::spec::CmmSpec::perfect() };
+    let spec = regrind_sim::spec::CmmSpec { not_found_share: 1.0, ..perfect_cmm() };
     let mut bench = Bench::measuring(spec, FAST, patient(), regrind_sim::dme::machine::Options::default()).await;
     bench.faults.add("PtMeas", 0, Fault::Severity(3));
     let plan = bench.plan(3);

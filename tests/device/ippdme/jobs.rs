@@ -1,5 +1,6 @@
 //! Jobs from their beginning to their end, with interventions of people and crashes.
 
+use crate::perfect::perfect_cmm;
 use regrind::device::{
     CarefulStart, Cmm, DeviceError, Interrupt, IppdmeCmm, Machine, MachineState, Outcome, Plan, Reconciled, TouchStatus,
 };
@@ -192,7 +193,7 @@ async fn lower_machine_speed_is_reported() {
 
 #[tokio::test]
 async fn missed_targets_retried_then_reported() {
-    let spec = CmmSpec { not_found_share: 0.5, ..CmmSpec::perfect() };
+    let spec = CmmSpec { not_found_share: 0.5, ..perfect_cmm() };
     let mut bench = Bench::measuring(spec, FAST, patient(), Options::default()).await;
     let plan = bench.plan(20);
     bench.begin(&plan).await.unwrap();

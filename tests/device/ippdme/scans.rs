@@ -1,5 +1,6 @@
 //! Scanned rows: their points lie on the part, each at its target, and no fault brings a wrong one.
 
+use crate::perfect::perfect_cmm;
 use regrind::device::{
     Cmm, DeviceError, Fault as MachineFault, Interrupt, IppdmeCmm, Machine, MachineState, Outcome, Plan, PlanTarget,
     Scanning, Status, TargetKind, TouchStatus,
@@ -35,7 +36,7 @@ fn rows(bench: &Bench) -> Plan {
 }
 
 async fn run_with_fault(fault: Option<Fault>) -> (Bench, Result<Status, DeviceError>) {
-    let mut bench = scanning(FAST, CmmSpec::perfect()).await;
+    let mut bench = scanning(FAST, perfect_cmm()).await;
     if let Some(fault) = fault {
         bench.faults.add("ScanOnCurve", 1, fault);
     }
@@ -110,7 +111,7 @@ async fn disconnect_in_scan_rescans_row() {
 
 #[tokio::test]
 async fn row_losing_surface_is_touched() {
-    let mut bench = scanning(FAST, CmmSpec { not_found_share: 0.1, ..CmmSpec::perfect() }).await;
+    let mut bench = scanning(FAST, CmmSpec { not_found_share: 0.1, ..perfect_cmm() }).await;
     let plan = rows(&bench);
     bench.begin(&plan).await.unwrap();
     let ended = until_still(&mut bench.cmm).await;
@@ -123,7 +124,7 @@ async fn row_losing_surface_is_touched() {
 
 /// Returns a job in its second row, which takes as long as a real one.
 async fn in_the_second_row(speed_mm_s: f64) -> Bench {
-    let mut bench = scanning(FAST, CmmSpec::perfect()).await;
+    let mut bench = scanning(FAST, perfect_cmm()).await;
     let mut settings = settings(bench.serving.local_addr().port(), patient());
     settings.scan = Some(Scanning { speed_mm_s, step_mm: 1.5 });
     bench.cmm = IppdmeCmm::new(settings);
@@ -168,7 +169,7 @@ async fn scan_refuses_reordered_values() {
 
 #[tokio::test]
 async fn unknown_tool_radius_touches_rows() {
-    let mut bench = scanning(FAST, CmmSpec::perfect()).await;
+    let mut bench = scanning(FAST, perfect_cmm()).await;
     bench.serving.with(|server| server.machine().hide_radius());
     let plan = rows(&bench);
     bench.begin(&plan).await.unwrap();
@@ -179,7 +180,7 @@ async fn unknown_tool_radius_touches_rows() {
 
 #[tokio::test]
 async fn non_scanning_probe_is_tool_fault() {
-    let mut bench = scanning(FAST, CmmSpec::perfect()).await;
+    let mut bench = scanning(FAST, perfect_cmm()).await;
     bench.serving.with(|server| server.machine().disable_scanning());
     let plan = rows(&bench);
     bench.begin(&plan).await.unwrap();

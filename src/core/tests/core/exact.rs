@@ -2,12 +2,31 @@
 
 use crate::common::{RADIUS_MM, centres, free_form, placed, points, pose, pose_error_mm};
 use nalgebra::{Matrix6, Vector6};
+use rand::RngExt;
 use regrind_core::geometry::{Point, Pose, Vector};
 use regrind_core::registration::{PointStatus, RegistrationOptions, Start, register};
 use regrind_core::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
-use regrind_sim::probe::{Placement, add_noise, add_outliers};
+use regrind_sim::probe::{Placement, add_noise};
 use regrind_sim::shape::{FreeForm, Shape};
+use regrind_sim::{Rng, Vec3};
+
+/// Moves one point in fifty by 0.05 mm to 5 mm in a random direction. Returns the indices of the moved points, in
+/// ascending order.
+fn add_outliers(rng: &mut Rng, points: &mut [Vec3]) -> Vec<usize> {
+    let mut moved = Vec::new();
+    for (index, point) in points.iter_mut().enumerate() {
+        if rng.random::<f64>() < 0.02 {
+            let mut direction = [[0.0; 3]];
+            add_noise(rng, &mut direction, 1.0);
+            let length = direction[0].iter().map(|c| c * c).sum::<f64>().sqrt();
+            let by = rng.random_range(0.05..5.0);
+            (0..3).for_each(|k| point[k] += by * direction[0][k] / length);
+            moved.push(index);
+        }
+    }
+    moved
+}
 
 /// Signed distance from the exact nominal surface and the unit normal at the foot, by Newton's method on (x, y).
 fn exact_distance(shape: &dyn Shape, p: &Point) -> (f64, Vector) {
@@ -134,7 +153,7 @@ fn register_with_noise_and_gross_outliers() {
         let mut rng = regrind_sim::rng(seed);
         let mut measured = placed(&placement, &clean);
         add_noise(&mut rng, &mut measured, 3e-4);
-        let gross = add_outliers(&mut rng, &mut measured, 0.02, 0.05, 5.0);
+        let gross = add_outliers(&mut rng, &mut measured);
         let measured = points(&measured);
         let mut keep = vec![true; measured.len()];
         for &k in &gross {
