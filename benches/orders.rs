@@ -14,6 +14,8 @@ mod keep;
 mod rig;
 #[path = "../tests/common/tries.rs"]
 mod tries;
+#[path = "../tests/common/wire_faults.rs"]
+mod wire_faults;
 
 use std::collections::BTreeMap;
 use std::path::Path;

@@ -8,8 +8,7 @@ use crate::options::{MachineOptions, RegisterLayout};
 use crate::register_encoding::WordOrder;
 use crate::registers::SimulatedMachine;
 use crate::simulated_cell::{MachineTable, ServedLine, ServedMachine, Simulation, object, settings, unavailable};
-use crate::wire::faults::SharedFaultPlan;
-use crate::wire::{Serving, Units, rtu};
+use crate::wire::{NoFaults, Serving, Units, rtu};
 
 /// Table `wire` of a Modbus machine.
 #[derive(Deserialize)]
@@ -98,7 +97,7 @@ async fn serve(line: LineSettings, units: Units, kinds: Vec<Kind>) -> Result<Ser
             (serving, format!("Modbus TCP {host}:{port}, {names}"), json!({ "host": host, "port": port }))
         }
         LineSettings::Rtu { device, baud } => {
-            let mut serving = Serving::rtu(units, rtu::Line::paced(baud), SharedFaultPlan::none())
+            let mut serving = Serving::rtu(units, rtu::Line::paced(baud), NoFaults)
                 .map_err(|error| format!("no pseudo-terminal can be created for {device}: {error}"))?;
             serving.link(&device)?;
             let place = format!("Modbus RTU {device} at {baud} baud, {names}");

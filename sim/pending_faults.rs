@@ -1,5 +1,5 @@
 //! Faults of a machine that is controlled line by line; each fault happens once. They differ from the faults of Modbus
-//! requests in [`crate::wire::faults`], which are drawn at random, can repeat, and can coincide in one request.
+//! requests on a wire ([`crate::wire::WireFaults`]).
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 

@@ -4,7 +4,6 @@
 //!  tcp      any number of clients, several units behind one port
 //!  rtu      a serial line, real or not, that takes as long as its baud rate says
 //!  pty      a serial line without hardware, opened by its path
-//!  faults   faults on Modbus, with their conditions
 //!  lines    lines of text over TCP, for I++ DME and linuxcncrsh
 //!  executed the path that an external controller executes, a line for each servo cycle
 //!  hits     a line for each touch, on a serial line or over TCP
@@ -14,7 +13,6 @@
 
 mod answer;
 pub mod executed_path;
-pub mod faults;
 pub mod hits;
 pub mod lines;
 #[cfg(not(unix))]
@@ -34,8 +32,7 @@ use std::time::Duration;
 use tokio::net::{TcpListener, ToSocketAddrs};
 use tokio::task::JoinSet;
 
-pub use answer::{SharedMachine, Units};
-use faults::SharedFaultPlan;
+pub use answer::{After, Delivery, Exchange, Framing, NoFaults, SharedMachine, Units, WireFaults, carry_out};
 use terminal_link::TerminalLink;
 
 /// Interval at which the machines' time advances.
@@ -52,11 +49,11 @@ pub async fn advance_machines(machines: Vec<SharedMachine>) {
 }
 
 /// Machines that are served until this is stopped or dropped.
-pub struct Serving {
+pub struct Serving<F = NoFaults> {
     local_addr: Option<SocketAddr>,
     path: Option<PathBuf>,
     machines: Units,
-    faults: SharedFaultPlan,
+    faults: F,
     tasks: JoinSet<()>,
     link: Option<TerminalLink>,
 }
@@ -68,18 +65,20 @@ impl Serving {
     /// # Errors
     /// Returns an error if the address cannot be bound.
     pub async fn tcp<M: Into<SharedMachine>>(addr: impl ToSocketAddrs, units: Vec<(u8, M)>) -> io::Result<Self> {
-        Self::tcp_with(addr, units, SharedFaultPlan::none()).await
+        Self::tcp_with(addr, units, NoFaults).await
     }
+}
 
+impl<F: WireFaults> Serving<F> {
     /// Serves machines over Modbus TCP at the address `addr`, with simulated faults. `units` contains each machine with
-    /// its unit id. `faults` is the fault plan. With port 0, the operating system selects a free port.
+    /// its unit id. With port 0, the operating system selects a free port.
     ///
     /// # Errors
     /// Returns an error if the address cannot be bound.
     pub async fn tcp_with<M: Into<SharedMachine>>(
         addr: impl ToSocketAddrs,
         units: Vec<(u8, M)>,
-        faults: SharedFaultPlan,
+        faults: F,
     ) -> io::Result<Self> {
         let listener = TcpListener::bind(addr).await?;
         let mut serving = Self::new(units, faults);
@@ -90,16 +89,12 @@ impl Serving {
     }
 
     /// Serves machines over Modbus RTU on a new pseudo-terminal. `units` contains each machine with its unit id, `line`
-    /// is the speed of the simulated serial line, and `faults` is the fault plan. [`Self::path`] returns the path of
+    /// is the speed of the simulated serial line, and `faults` are the simulated faults. [`Self::path`] returns the path of
     /// the pseudo-terminal; a client opens this path like a serial port.
     ///
     /// # Errors
     /// Returns an error if no pseudo-terminal is available.
-    pub fn rtu<M: Into<SharedMachine>>(
-        units: Vec<(u8, M)>,
-        line: rtu::Line,
-        faults: SharedFaultPlan,
-    ) -> io::Result<Self> {
+    pub fn rtu<M: Into<SharedMachine>>(units: Vec<(u8, M)>, line: rtu::Line, faults: F) -> io::Result<Self> {
         let (port, path) = pty::open()?;
         let mut serving = Self::new(units, faults);
         serving.path = Some(path);
@@ -123,7 +118,7 @@ impl Serving {
         Ok(())
     }
 
-    fn new<M: Into<SharedMachine>>(units: Vec<(u8, M)>, faults: SharedFaultPlan) -> Self {
+    fn new<M: Into<SharedMachine>>(units: Vec<(u8, M)>, faults: F) -> Self {
         let machines: Units = units.into_iter().map(|(unit, machine)| (unit, machine.into())).collect();
         let living = machines.iter().map(|(_, machine)| machine.clone()).collect();
         let mut tasks = JoinSet::new();
@@ -152,9 +147,8 @@ impl Serving {
         self.machines.iter().find(|(id, _)| *id == unit).map(|(_, machine)| machine)
     }
 
-    /// Returns the fault plan of the served machines. A caller can replace this plan at any time with
-    /// [`SharedFaultPlan::set`].
-    pub fn faults(&self) -> &SharedFaultPlan {
+    /// Returns the faults of the wire.
+    pub fn faults(&self) -> &F {
         &self.faults
     }
 

@@ -9,8 +9,7 @@ use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite};
 
-use super::answer::{After, Framing, Units, answer};
-use super::faults::SharedFaultPlan;
+use super::answer::{After, Exchange, Framing, Units, WireFaults};
 use crate::register_encoding::crc16;
 
 /// Silence after which an incomplete frame is dropped. It is far longer than 3.5 characters, since a busy computer
@@ -49,7 +48,7 @@ impl Line {
 ///
 /// # Errors
 /// The port cannot be read or written any more.
-pub async fn serve_rtu<P>(mut port: P, units: Units, line: Line, faults: SharedFaultPlan) -> io::Result<()>
+pub async fn serve_rtu<P>(mut port: P, units: Units, line: Line, faults: impl WireFaults) -> io::Result<()>
 where
     P: AsyncRead + AsyncWrite + Unpin,
 {
@@ -62,7 +61,7 @@ where
             continue;
         }
         tokio::time::sleep(if line.paced { line.characters(frame.len()) } else { Duration::ZERO } + line.gap()).await;
-        let mut delivery = answer(&units, &faults, Framing::Rtu, unit, pdu);
+        let mut delivery = faults.answer(&Exchange { units: &units, framing: Framing::Rtu, unit, pdu });
         if line.paced {
             delivery.delay += line.characters(delivery.bytes.len());
         }

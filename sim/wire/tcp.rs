@@ -7,8 +7,7 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
 
-use super::answer::{After, Framing, Units, answer};
-use super::faults::SharedFaultPlan;
+use super::answer::{After, Exchange, Framing, Units, WireFaults};
 
 /// Time between two attempts to accept a client.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(20);
@@ -28,7 +27,7 @@ pub(super) async fn next_client(listener: &TcpListener) -> TcpStream {
 /// Answers Modbus TCP requests of any number of clients that connect to `listener`. `units` are the simulated machines
 /// with their unit ids. `faults` are the simulated faults. Runs until its future is dropped. All connections are then
 /// closed.
-pub async fn serve_tcp(listener: TcpListener, units: Units, faults: SharedFaultPlan) {
+pub async fn serve_tcp(listener: TcpListener, units: Units, faults: impl WireFaults) {
     let mut clients = JoinSet::new();
     loop {
         tokio::select! {
@@ -42,14 +41,14 @@ pub async fn serve_tcp(listener: TcpListener, units: Units, faults: SharedFaultP
 }
 
 /// Answers the Modbus TCP requests of one client on `stream`. `units` are the simulated machines with their unit ids.
-/// `faults` is the plan of the simulated faults.
+/// `faults` are the simulated faults.
 ///
 /// Returns `Ok` in three cases: after a header that is not Modbus TCP, after a simulated fault has closed the
 /// connection, or when the client disconnects after a simulated fault has stopped all answers.
 ///
 /// # Errors
 /// The stream cannot be read or written any more, for example because the client has disconnected.
-pub async fn serve_client<S>(mut stream: S, units: &Units, faults: &SharedFaultPlan) -> io::Result<()>
+pub async fn serve_client<S>(mut stream: S, units: &Units, faults: &impl WireFaults) -> io::Result<()>
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
@@ -64,7 +63,7 @@ where
         let mut pdu = vec![0; usize::from(length) - 1];
         stream.read_exact(&mut pdu).await?;
         let framing = Framing::Tcp { transaction: u16::from_be_bytes([t0, t1]) };
-        let delivery = answer(units, faults, framing, unit, &pdu);
+        let delivery = faults.answer(&Exchange { units, framing, unit, pdu: &pdu });
         delivery.send(&mut stream).await?;
         match delivery.after {
             After::Open => {}

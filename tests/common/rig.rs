@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use crate::wire_faults::{Fault, FaultPlan, Serving, SharedFaultPlan, When};
 use regrind::cell::Actor;
 use regrind::config::{CellConfig, LinkConfig};
 use regrind::device::{ModbusCmm, ModbusGrinder};
@@ -15,8 +16,6 @@ use regrind::setup;
 use regrind_sim::options::MachineOptions;
 use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::spec::WorldSpec;
-use regrind_sim::wire::Serving;
-use regrind_sim::wire::faults::{Fault, FaultPlan, SharedFaultPlan, When};
 use regrind_sim::world::World;
 use serde::Deserialize;
 use serde_json::json;
@@ -134,7 +133,7 @@ impl Rig {
     /// Calls a test's callback at the moment when a command arrives at a machine.
     pub fn watch(&self, machine: usize, mut watch: Watch) {
         let came = Arc::clone(&self.came[machine]);
-        let look = move |request: &regrind_sim::wire::faults::Request| {
+        let look = move |request: &crate::wire_faults::Request| {
             let beat = request.function == 16 && request.address == 36;
             came.lock().unwrap().push(ReceivedRequest { at: Instant::now(), beat, command: request.command });
             if let Some(command) = request.command {

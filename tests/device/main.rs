@@ -14,3 +14,5 @@ mod perfect;
 mod program;
 mod read_ahead;
 mod toy;
+#[path = "../common/wire_faults.rs"]
+mod wire_faults;

@@ -15,14 +15,13 @@ use regrind::geometry::Grid;
 use regrind_sim::body::Kind;
 use regrind_sim::command::{Command as SimCommand, CommandFrame as SimFrame};
 use regrind_sim::options::{MachineOptions, RegisterLayout};
-use regrind_sim::wire::Serving;
-use regrind_sim::wire::faults::{Fault, FaultPlan, Request, SharedFaultPlan, When};
 use regrind_sim::wire::rtu::Line as SerialLine;
 use regrind_sim::{register_encoding, registers};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket};
 
 use crate::toy::{Toy, pass};
+use crate::wire_faults::{Fault, FaultPlan, Request, Serving, SharedFaultPlan, When};
 
 // ---- machines to talk to ------------------------------------------------------------------------------------------------------------
 
@@ -202,7 +201,10 @@ async fn word_orders_and_moved_registers() {
         };
         let swaps_bytes = word_order.swaps_bytes();
         let options = MachineOptions { word_order: of_sim, swaps_bytes, layout, ..MachineOptions::default() };
-        let serving = Serving::tcp("127.0.0.1:0", vec![(7, toy(Kind::Cmm, AT_ONCE, options))]).await.unwrap();
+        let serving =
+            Serving::tcp_with("127.0.0.1:0", vec![(7, toy(Kind::Cmm, AT_ONCE, options))], SharedFaultPlan::none())
+                .await
+                .unwrap();
         let registers =
             RegisterMap { word_order, status: 1064, command: 1040, outbox_page: 2462, ..RegisterMap::default() };
         let settings = ModbusSettings { unit: 7, registers, ..settings(&serving) };

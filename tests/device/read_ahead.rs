@@ -14,13 +14,12 @@ use regrind::device::{
 use regrind_sim::body::Kind;
 use regrind_sim::command::State as At;
 use regrind_sim::options::MachineOptions;
-use regrind_sim::wire::Serving;
-use regrind_sim::wire::faults::{Fault, FaultPlan, Request, SharedFaultPlan, When};
 use regrind_sim::wire::rtu::Line as SerialLine;
 use regrind_sim::{register_encoding, registers};
 
 use crate::modbus::{assert_exact, began, claimed, job_of, patient, plan, rtu, settings, wait_for_state};
 use crate::toy::Toy;
+use crate::wire_faults::{Fault, FaultPlan, Request, Serving, SharedFaultPlan, When};
 
 const HEADER: u16 = 400;
 const SELECT: u16 = 460;
@@ -139,7 +138,7 @@ async fn read_ahead_records_across_pages() {
     let options =
         MachineOptions { speed: 0.0, word_order: register_encoding::WordOrder::Little, ..MachineOptions::default() };
     let machine = registers::SimulatedMachine::new(Box::new(toy().in_counts()), 0xb007, options);
-    let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine)]).await.unwrap();
+    let serving = Serving::tcp_with("127.0.0.1:0", vec![(1, machine)], SharedFaultPlan::none()).await.unwrap();
     let mut settings = patient(settings(&serving));
     settings.registers.word_order = regrind::device::WordOrder::Little;
     let mut cmm = half_done(&serving, settings, &plan).await;

@@ -66,4 +66,6 @@ mod touches;
 mod tries;
 mod truth;
 mod watching;
+#[path = "../common/wire_faults.rs"]
+mod wire_faults;
 mod worlds;

@@ -18,7 +18,6 @@ use regrind::drive::{BlockingExecutor, BlockingWork, Drive, InterruptedRun, Orde
 use regrind::journal::{AuditKey, Header, Journal, Reader, RecordKind, RunLock, verify};
 use regrind::setup;
 use regrind_sim::event_log::HandshakeEvent;
-use regrind_sim::wire::faults::{FaultPlan, SharedFaultPlan};
 use serde_json::json;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -35,6 +34,7 @@ use crate::part::{self, RequiredQuality};
 use crate::person::{GivenOrder, Person, actor};
 use crate::schedule::{Act, Schedule, Tally};
 use crate::wire::Wires;
+use crate::wire_faults::{FaultPlan, SharedFaultPlan};
 
 /// Time after which no fault is drawn.
 const CALM_AFTER: Duration = Duration::from_secs(90);

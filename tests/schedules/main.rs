@@ -25,6 +25,8 @@ mod programs;
 mod schedule;
 mod touches;
 mod wire;
+#[path = "../common/wire_faults.rs"]
+mod wire_faults;
 
 use std::panic::AssertUnwindSafe;
 use std::sync::atomic::{AtomicU64, Ordering};

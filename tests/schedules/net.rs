@@ -15,7 +15,6 @@ use regrind::device::{ConnectFuture, Connector, LineAddress, LineStream};
 use regrind_sim::dme::Server;
 use regrind_sim::rsh::Controller;
 use regrind_sim::wire::Units;
-use regrind_sim::wire::faults::SharedFaultPlan;
 use regrind_sim::wire::lines::SharedLineServer;
 use regrind_sim::wire::rtu::{Line as Pace, serve_rtu};
 use regrind_sim::wire::tcp::serve_client;
@@ -26,6 +25,7 @@ use tokio::task::AbortHandle;
 use crate::cue::Cues;
 use crate::life::Life;
 use crate::wire::{Listening, Watched, Wires};
+use crate::wire_faults::SharedFaultPlan;
 
 /// Current behaviour of a network.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -12,7 +12,6 @@ use regrind_sim::options::RegisterLayout;
 use regrind_sim::register_encoding::WordOrder;
 use regrind_sim::rsh::Controller;
 use regrind_sim::wire::SharedMachine;
-use regrind_sim::wire::faults::{Fault, FaultPlan, SharedFaultPlan, When};
 use regrind_sim::wire::lines::SharedLineServer;
 use tokio::time::{Instant, sleep};
 
@@ -22,6 +21,7 @@ use crate::machines::Plant;
 use crate::net::{Net, Weather};
 use crate::person::{GivenOrder, give, take_supplies};
 use crate::schedule::Act;
+use crate::wire_faults::{Fault, FaultPlan, SharedFaultPlan, When};
 
 /// Receiver of orders in the current life of the program.
 pub type Office = Arc<Mutex<Option<(OrderSender, Arc<Life>)>>>;

@@ -9,7 +9,6 @@ use rand::{RngExt as _, SeedableRng as _};
 use regrind::journal::free_bytes;
 use regrind_sim::dme::faults::Fault as OfDme;
 use regrind_sim::rsh::faults::Fault as OfRsh;
-use regrind_sim::wire::faults::Fault;
 
 use crate::checker::{Evidence, check};
 use crate::cue::{Cue, When, any_length};
@@ -17,6 +16,7 @@ use crate::happening::Happening;
 use crate::ledger::Disk;
 use crate::net::Weather;
 use crate::part::RequiredQuality;
+use crate::wire_faults::Fault;
 
 /// Maximum number of lives of the program that are cut short.
 const MAX_DEATHS: usize = 3;

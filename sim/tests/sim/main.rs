@@ -14,4 +14,6 @@ mod payloads;
 #[path = "../../../tests/common/perfect.rs"]
 mod perfect;
 mod registers;
+#[path = "../../../tests/common/wire_faults.rs"]
+mod wire_faults;
 mod wires;

@@ -5,13 +5,12 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use crate::counter::{Counter, digest, payloads};
+use crate::wire_faults::{Fault, FaultPlan, Serving, SharedFaultPlan, When};
 use regrind_sim::body::Kind;
 use regrind_sim::command::{Command, CommandFrame, State};
 use regrind_sim::options::MachineOptions;
 use regrind_sim::register_encoding::{WordOrder, bytes_of, crc16, registers_of};
 use regrind_sim::registers::SimulatedMachine;
-use regrind_sim::wire::Serving;
-use regrind_sim::wire::faults::{Fault, FaultPlan, SharedFaultPlan, When};
 #[cfg(unix)]
 use regrind_sim::wire::pty;
 use regrind_sim::wire::rtu::Line;
@@ -113,7 +112,7 @@ async fn connect(serving: &Serving, unit: u8) -> Context {
 
 async fn serve() -> Serving {
     let units = vec![(1, machine(Kind::Cmm)), (2, machine(Kind::Grinder))];
-    Serving::tcp("127.0.0.1:0", units).await.unwrap()
+    Serving::tcp_with("127.0.0.1:0", units, SharedFaultPlan::none()).await.unwrap()
 }
 
 #[tokio::test]
@@ -175,7 +174,7 @@ async fn tcp_exceptions_for_unknown_requests() {
 async fn tcp_silent_client_causes_hold() {
     let options = MachineOptions { speed: 0.001, lost_after_ms: 300, ..MachineOptions::default() };
     let machine = SimulatedMachine::new(Box::new(Counter::new(Kind::Cmm, 20.0)), 5, options);
-    let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine)]).await.unwrap();
+    let serving = Serving::tcp_with("127.0.0.1:0", vec![(1, machine)], SharedFaultPlan::none()).await.unwrap();
     let mut wire = connect(&serving, 1).await;
     let claim =
         CommandFrame { sequence: 1, command: Command::Claim as u16, owner: 3, epoch: 1, ..CommandFrame::default() };
@@ -208,7 +207,7 @@ async fn serving_stop_closes_port() {
     let machines = serving.machines().clone();
     serving.stop().await;
     assert_eq!(patiently(raw.read(&mut [0; 8])).await.unwrap_or(0), 0);
-    let again = Serving::tcp(addr, machines).await.unwrap();
+    let again = Serving::tcp_with(addr, machines, SharedFaultPlan::none()).await.unwrap();
     let mut raw = TcpStream::connect(addr).await.unwrap();
     ask(&mut raw, 1, 2, &READ).await;
     assert_eq!(reply(&mut raw, 11).await.len(), 11);
@@ -399,7 +398,8 @@ async fn freeze_thaw_reboot_and_tear_faults() {
 #[tokio::test]
 async fn reboot_fault_in_state() {
     for state in [State::Prepared, State::Execute, State::Complete] {
-        let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine(Kind::Cmm))]).await.unwrap();
+        let serving =
+            Serving::tcp_with("127.0.0.1:0", vec![(1, machine(Kind::Cmm))], SharedFaultPlan::none()).await.unwrap();
         serving.faults().set(FaultPlan::new(0).once(When::InState(state), Fault::Reboot));
         let mut wire = connect(&serving, 1).await;
         let claim =

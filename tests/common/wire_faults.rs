@@ -1,15 +1,20 @@
-//! Faults of a wire, with their conditions and their number.
+//! Faults of a Modbus wire, with their conditions and their number.
 //!
 //! A [`FaultPlan`] is a list of rules; each selects requests and gives their faults. Random choices come from a seed,
 //! so a plan breaks the same requests in every run with the same order of requests.
+#![allow(dead_code, reason = "not every test that includes this uses all of it")]
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use rand::RngExt;
+use regrind_sim::Rng;
+use regrind_sim::command::State;
+use regrind_sim::registers::SimulatedMachine;
+use regrind_sim::wire::{After, Delivery, Exchange, Framing, SharedMachine, WireFaults, carry_out};
 
-use crate::Rng;
-use crate::command::State;
+/// Machines that are served on a wire with faults.
+pub type Serving = regrind_sim::wire::Serving<SharedFaultPlan>;
 
 /// Fault of a request or of its answer.
 #[derive(Clone, Debug, PartialEq)]
@@ -144,7 +149,7 @@ impl FaultPlan {
     /// Creates a plan without faults. `seed` initializes the random choices of the rules that the caller adds to the
     /// plan later. Equal seeds give equal choices for the same sequence of requests.
     pub fn new(seed: u64) -> Self {
-        Self { rules: Vec::new(), rng: crate::rng(seed), requests: 0, fired: Vec::new(), again: Vec::new() }
+        Self { rules: Vec::new(), rng: regrind_sim::rng(seed), requests: 0, fired: Vec::new(), again: Vec::new() }
     }
 
     /// Creates a plan in which each request has a fault with the probability `share`, from 0 to 1. Each fault is drawn
@@ -215,7 +220,7 @@ impl SharedFaultPlan {
     /// Counts the request `request` and writes its number, from 1, into `request.number`. Returns the faults that the
     /// rules of the plan select for this request. The list is empty if no rule selects it. Each returned fault is also
     /// added to the list of faults that have happened.
-    pub(crate) fn draw(&self, request: &mut Request) -> Vec<Fault> {
+    fn draw(&self, request: &mut Request) -> Vec<Fault> {
         let mut plan = self.lock();
         let FaultPlan { rules, rng, requests, fired, .. } = &mut *plan;
         *requests += 1;
@@ -239,13 +244,13 @@ impl SharedFaultPlan {
 
     /// Stores a request that will be carried out a second time. `before` is the number of the later request before
     /// which this happens. `unit` is the unit id of the stored request, and `pdu` is its protocol data unit.
-    pub(crate) fn defer(&self, before: u64, unit: u8, pdu: &[u8]) {
+    fn defer(&self, before: u64, unit: u8, pdu: &[u8]) {
         self.lock().again.push((before, unit, pdu.to_vec()));
     }
 
     /// Removes and returns the stored requests that must be carried out a second time before the request with the
     /// number `number`. Each entry is the unit id and the protocol data unit (PDU) of a stored request.
-    pub(crate) fn take_due(&self, number: u64) -> Vec<(u8, Vec<u8>)> {
+    fn take_due(&self, number: u64) -> Vec<(u8, Vec<u8>)> {
         let mut plan = self.lock();
         let (due, later) = plan.again.drain(..).partition(|(before, ..)| *before <= number);
         plan.again = later;
@@ -256,4 +261,98 @@ impl SharedFaultPlan {
     fn lock(&self) -> MutexGuard<'_, FaultPlan> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+impl WireFaults for SharedFaultPlan {
+    /// Executes a request and returns the answer with its faults. First executes the stored requests whose second
+    /// execution is due before this request. A fault can prevent the execution of the request.
+    fn answer(&self, exchange: &Exchange<'_>) -> Delivery {
+        let Exchange { units, framing, unit, pdu } = *exchange;
+        let mut request = describe(exchange);
+        let met = self.draw(&mut request);
+        for (unit, pdu) in self.take_due(request.number) {
+            if let Some((_, machine)) = units.iter().find(|(id, _)| *id == unit) {
+                carry_out(machine, &pdu);
+            }
+        }
+        let mut exception = None;
+        for fault in &met {
+            match (fault, exchange.machine()) {
+                (Fault::Exception(code), _) => exception = Some(vec![pdu[0] | 0x80, *code]),
+                (Fault::DropRequest, _) => exception = Some(Vec::new()),
+                (Fault::CarryOutAgain(after), _) => self.defer(request.number + after, unit, pdu),
+                (Fault::Freeze, Some(machine)) => machine.with(|machine| machine.freeze(true)),
+                (Fault::Thaw, Some(machine)) => machine.with(|machine| machine.freeze(false)),
+                (Fault::Reboot, Some(machine)) => machine.with(SimulatedMachine::reboot),
+                (Fault::TornStatus, Some(machine)) => machine.with(SimulatedMachine::tear_status),
+                _ => {}
+            }
+        }
+        deliver(framing, unit, exception.unwrap_or_else(|| exchange.reply()), &met)
+    }
+}
+
+fn describe(exchange: &Exchange<'_>) -> Request {
+    let Exchange { unit, pdu, .. } = *exchange;
+    let word = |at: usize| pdu.get(at..at + 2).map_or(0, |pair| u16::from_be_bytes([pair[0], pair[1]]));
+    let (address, count) = (word(1), if pdu[0] == 6 { 1 } else { word(3) });
+    let look = |machine: &SharedMachine| machine.with(|m| (m.state(), m.layout().command));
+    let (state, block) = exchange.machine().map(look).unzip();
+    let is_command = pdu[0] == 16 && block == Some(address) && count == 20;
+    let command = is_command.then(|| word(10));
+    Request { number: 0, unit, function: pdu[0], address, count, command, state }
+}
+
+fn deliver(framing: Framing, unit: u8, mut reply: Vec<u8>, met: &[Fault]) -> Delivery {
+    let mut delivery = Delivery::at_once(Vec::new());
+    if reply.is_empty() {
+        return delivery;
+    }
+    let (mut framing, mut unit) = (framing, unit);
+    for fault in met {
+        match fault {
+            Fault::WrongTransaction => {
+                if let Framing::Tcp { transaction } = &mut framing {
+                    *transaction ^= 0x5A5A;
+                }
+            }
+            Fault::WrongUnit => unit ^= 0x40,
+            Fault::WrongFunction => reply[0] ^= 0x01,
+            Fault::FlipData => reply.last_mut().into_iter().for_each(|byte| *byte ^= 0x10),
+            Fault::Fewer if reply[0] == 3 && reply[1] >= 2 => {
+                reply[1] -= 2;
+                reply.truncate(reply.len() - 2);
+            }
+            Fault::Lie(instead) if reply[0] == 3 => {
+                for (register, value) in instead {
+                    let at = 2 + 2 * register;
+                    reply.get_mut(at..at + 2).into_iter().for_each(|word| word.copy_from_slice(&value.to_be_bytes()));
+                }
+            }
+            Fault::WordSwap if reply[0] == 3 => reply[2..].chunks_exact_mut(4).for_each(|pair| pair.rotate_left(2)),
+            _ => {}
+        }
+    }
+    delivery.bytes = framing.frame(unit, &reply, met.contains(&Fault::FlipCrc));
+    for fault in met {
+        match fault {
+            Fault::DropReply => delivery.bytes.clear(),
+            Fault::DelayReply(delay) => delivery.delay = *delay,
+            Fault::DuplicateReply => delivery.bytes = delivery.bytes.repeat(2),
+            Fault::Truncate(length) => delivery.bytes.truncate(*length),
+            Fault::Extra(bytes) => delivery.bytes.extend(bytes),
+            Fault::Noise(bytes) => delivery.bytes = [&bytes[..], &delivery.bytes].concat(),
+            Fault::Split(pause) => delivery.pause = Some(*pause),
+            Fault::Disconnect(length) => {
+                delivery.bytes.truncate(*length);
+                delivery.after = After::Closed;
+            }
+            Fault::Silence => {
+                delivery.bytes.clear();
+                delivery.after = After::Silent;
+            }
+            _ => {}
+        }
+    }
+    delivery
 }
