@@ -9,6 +9,10 @@
 //! Only the communication with the machines is left out. WAY selects the lines whose names begin with it. The figure is
 //! written to `target/convergence/convergence.svg`.
 
+#[path = "../tests/common/payloads.rs"]
+mod client_payloads;
+#[path = "../tests/common/perfect.rs"]
+mod perfect;
 #[path = "../tests/run/study.rs"]
 mod study;
 

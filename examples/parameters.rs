@@ -9,6 +9,10 @@
 //! and with the tilts locked. Every part is made twice from the same blank on the same machines: with parameters, and
 //! by the map alone.
 
+#[path = "../tests/common/payloads.rs"]
+mod client_payloads;
+#[path = "../tests/common/perfect.rs"]
+mod perfect;
 #[path = "../tests/run/study.rs"]
 mod study;
 

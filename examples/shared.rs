@@ -8,6 +8,10 @@
 //! each recipe that ships with a truth. Both machines have experience with one other recipe, the next of the list. The
 //! first machine has made PARTS (2) of the recipe. DIFFER selects the lines whose names begin with it.
 
+#[path = "../tests/common/payloads.rs"]
+mod client_payloads;
+#[path = "../tests/common/perfect.rs"]
+mod perfect;
 #[path = "../tests/run/study.rs"]
 mod study;
 

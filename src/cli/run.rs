@@ -7,7 +7,7 @@ use std::time::SystemTime;
 
 use clap::Args;
 use regrind::cell::{Actor, CellPlan, Ending, FirstStep, TABLE_VERSION};
-use regrind::config::{BUILT_IN_CELL, CellConfig, LinkConfig};
+use regrind::config::{BUILT_IN_CELL, CellConfig};
 use regrind::drive::Task;
 use regrind::formats::{KnowledgeOrigin, LEARNED, Learned, LearnedError, SettingIdentity};
 use regrind::journal::{AuditKey, Header, Journal, free_bytes, utc_to_the_second};
