@@ -70,7 +70,7 @@ impl Like {
             }
             if of.kind == RecordKind::End {
                 let mut content = of.value();
-                content["records"] = (k as u64).into();
+                content["records_before"] = (k as u64).into();
                 record.payload = regrind::journal::canonical_json(&content);
             }
             record.prev_hash = head.clone();

@@ -5,11 +5,12 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
+use regrind::formats::run_files::RunFile;
 use regrind::journal::{
     Anchor, DATABASE, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Verified, verify_against,
 };
 use regrind::record::{Begin, RunContent, begin_of};
-use regrind::report::{RUN_REPORT, run_report, words};
+use regrind::report::{run_report, words};
 use serde_json::json;
 
 use super::Outcome;
@@ -222,17 +223,19 @@ fn is_folder_of_runs(folder: &Path) -> bool {
 /// the names of these files. The file `report.html` is reported only if it differs from a report made from the journal
 /// now. Returns an empty text if there is nothing to report.
 fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
-    let report = |name: &&String| **name == RUN_REPORT;
-    let edited = unrecorded.iter().any(|name| report(&name))
-        && std::fs::read_to_string(folder.join(RUN_REPORT)).ok() != run_report(folder).ok();
+    let report = RunFile::Report.name();
+    let edited = unrecorded.iter().any(|name| name == report)
+        && std::fs::read_to_string(folder.join(report)).ok() != run_report(folder).ok();
+    let others: Vec<&str> = unrecorded.iter().map(String::as_str).filter(|name| *name != report).collect();
     let report = if edited {
-        "report      report.html differs from the report that Regrind now makes from the record: a person changed the file, or the version of Regrind changed\n"
+        format!(
+            "report      {report} differs from the report that Regrind now makes from the record: a person changed the file, or the version of Regrind changed\n"
+        )
     } else {
-        ""
+        String::new()
     };
-    let others: Vec<&str> = unrecorded.iter().filter(|name| *name != RUN_REPORT).map(String::as_str).collect();
     match others.len() {
-        0 => report.to_owned(),
+        0 => report,
         _ => format!("{report}files       not in the record, so not verified: {}\n", others.join(", ")),
     }
 }

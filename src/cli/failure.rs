@@ -185,7 +185,7 @@ pub(super) enum Failure {
     )]
     Evidence,
     #[error(
-        "--map is too short: give at least the first 8 digits of the hash of the map that the grinder uses; the hash is in correction.json"
+        "--map is too short: give at least the first 8 digits of the hash of the map that the grinder uses; the hash is in correction.csv"
     )]
     ShortMap,
     #[error("the command `confirm clear` requires the option --machine with the machine that you checked")]

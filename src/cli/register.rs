@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use regrind::formats::run_files::CycleFile;
 use regrind::formats::{
     Alternative, Columns, NominalInput, NotedPoints, RegistrationDocument, ResultFolder, Table, Unit, is_map,
     read_measured_with_notes, save_form, save_registration,
@@ -237,7 +238,8 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
             ),
         );
     }
-    line("files", format!("registration.json, deviations.csv, deviation_uncertainty.csv in {}", folder.display()));
+    let files = [CycleFile::Registration, CycleFile::Deviations, CycleFile::DeviationUncertainty].map(CycleFile::name);
+    line("files", format!("{} in {}", files.join(", "), folder.display()));
     text
 }
 

@@ -9,9 +9,10 @@ use clap::Args;
 use regrind::cell::{Actor, CellPlan, TABLE_VERSION};
 use regrind::config::CellConfig;
 use regrind::drive::{InterruptedRun, Request, Task};
+use regrind::formats::run_files::{RunFile, newest_cycle};
 use regrind::formats::{FormatError, Learned};
 use regrind::journal::{
-    Artefact, DATABASE, Journal, JournalError, LOCK, Reader, RecordKind, RunLock, may_be_lost, newest_cycle, verify,
+    Artefact, DATABASE, Journal, JournalError, LOCK, Reader, RecordKind, RunLock, may_be_lost, verify,
 };
 use regrind::recipe::Recipe;
 use regrind::record::{Begin, Content, PartStart, RecordedPlan, Remark, RunContent};
@@ -19,7 +20,7 @@ use regrind::setup;
 
 use super::failure::Failure;
 use super::live::{PreparedRun, RunContext, outcome};
-use super::run::{LEARNED_FROM, epoch, operator, within};
+use super::run::{epoch, operator, within};
 use super::{Outcome, check, control, key};
 
 /// Resume a held cell, or a run whose program has ended
@@ -85,8 +86,8 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     // If the working folder is gone, a recipe without files there still works. Any other recipe reports the missing
     // file.
     let _ = std::env::set_current_dir(&begun.working_folder);
-    let recipe = check::or_show(Recipe::parse(&begun.recipe, &begun.text(folder, "recipe.toml")?))?;
-    let mut cell = check::or_show(CellConfig::parse(&begun.cell, &begun.text(folder, "cell.toml")?))?;
+    let recipe = check::or_show(Recipe::parse(&begun.recipe, &begun.text(folder, RunFile::Recipe)?))?;
+    let mut cell = check::or_show(CellConfig::parse(&begun.cell, &begun.text(folder, RunFile::Cell)?))?;
     cell.rehearsal = begun.rehearsal;
     if within(&cell) {
         return Err(Failure::WorldGone { run: folder.to_owned() });
@@ -224,11 +225,11 @@ impl RunStart {
         }
     }
 
-    /// Returns the text of the input file `name` (recipe or cell file) that the run `run` stored when it began. Returns
+    /// Returns the text of the input file `file` (recipe or cell file) that the run `run` stored when it began. Returns
     /// an error if the record does not list the file or if its content has changed.
-    fn text(&self, run: &Path, name: &str) -> Result<String, Failure> {
-        let path = run.join(name);
-        let Some(file) = self.files.get(name) else {
+    fn text(&self, run: &Path, file: RunFile) -> Result<String, Failure> {
+        let path = run.join(file.name());
+        let Some(file) = self.files.get(file.name()) else {
             let source =
                 std::io::Error::new(std::io::ErrorKind::NotFound, "the record of this run does not contain this file");
             return Err(Failure::File(FormatError::Unreadable { path, source }));
@@ -247,9 +248,9 @@ impl RunStart {
         if let Some(seed) = self.seed {
             task.setting = task.setting.with_seed(seed);
         }
-        if let Some(learned) = self.files.get(LEARNED_FROM) {
+        if let Some(learned) = self.files.get(RunFile::LearnedFrom.name()) {
             let text = learned.read(run).map_err(Failure::Journal)?;
-            let learned = Learned::from_saved(&run.join(LEARNED_FROM), &text).map_err(Failure::Learned)?;
+            let learned = Learned::from_saved(&run.join(&learned.name), &text).map_err(Failure::Learned)?;
             let from = learned.run.clone();
             task.start_from_learned(learned).map_err(|source| Failure::TooMuchLearned { run: from, source })?;
         }

@@ -9,7 +9,8 @@ use clap::Args;
 use regrind::cell::{Actor, CellPlan, Ending, FirstStep, TABLE_VERSION};
 use regrind::config::{BUILT_IN_CELL, CellConfig};
 use regrind::drive::Task;
-use regrind::formats::{KnowledgeOrigin, LEARNED, Learned, LearnedError, SettingIdentity};
+use regrind::formats::run_files::{CycleFolder, RunFile};
+use regrind::formats::{KnowledgeOrigin, Learned, LearnedError, SettingIdentity};
 use regrind::journal::{AuditKey, Header, Journal, free_bytes, utc_to_the_second};
 use regrind::recipe::Recipe;
 use regrind::record::{PartStart, RecordedPlan, RunContent};
@@ -19,9 +20,6 @@ use super::failure::Failure;
 use super::live::{PreparedRun, RunContext, outcome};
 use super::succession::RunPlace;
 use super::{Outcome, check, key, outside, plan, plant, serve, simulated};
-
-/// Name of the file in the run folder with the knowledge of an earlier run from which the run began.
-pub(super) const LEARNED_FROM: &str = "learned_from.json";
 
 /// Run correction cycles from a recipe until the part is accepted
 #[derive(Args, Debug)]
@@ -230,7 +228,9 @@ impl EarlierKnowledge {
         let mut earlier = Self::default();
         // Without the folder there are no runs yet.
         let Ok(entries) = std::fs::read_dir(runs) else { return earlier };
-        let written = |run: PathBuf| Some((std::fs::metadata(run.join(LEARNED)).and_then(|m| m.modified()).ok()?, run));
+        let written = |run: PathBuf| {
+            Some((std::fs::metadata(run.join(RunFile::Learned.name())).and_then(|m| m.modified()).ok()?, run))
+        };
         let mut all: Vec<_> = entries.filter_map(|entry| written(entry.ok()?.path())).collect();
         all.sort();
         for (_, run) in all.into_iter().rev() {
@@ -352,10 +352,11 @@ fn begin(
     key: Option<AuditKey>,
 ) -> Result<Journal, Failure> {
     let mut journal = Journal::create_with(live.folder, header, key).map_err(Failure::Journal)?;
-    journal.store("recipe.toml", live.recipe.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
-    journal.store("cell.toml", live.cell.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
+    let mut store = |file: RunFile, text: &[u8]| journal.store(file.name(), text, 0, 0).map_err(Failure::Journal);
+    store(RunFile::Recipe, live.recipe.text().as_bytes())?;
+    store(RunFile::Cell, live.cell.text().as_bytes())?;
     if let Some((_, text)) = learned {
-        journal.store(LEARNED_FROM, &text, 0, 0).map_err(Failure::Journal)?;
+        store(RunFile::LearnedFrom, &text)?;
     }
     Ok(journal)
 }
@@ -364,9 +365,9 @@ fn begin(
 /// run folder. Adds these files to `journal`. Returns an error if the program cannot be computed or a file cannot be
 /// written.
 fn record_first_correction(task: &Task, journal: &mut Journal) -> Result<(), Failure> {
-    let folder = journal.folder().join("cycle-0");
-    for name in task.save_first_pass(&folder).map_err(Failure::Programs)? {
-        journal.adopt(&format!("cycle-0/{name}"), 0, 0).map_err(Failure::Journal)?;
+    let folder = CycleFolder::new(0).to_string();
+    for name in task.save_first_pass(&journal.folder().join(&folder)).map_err(Failure::Programs)? {
+        journal.adopt(&format!("{folder}/{name}"), 0, 0).map_err(Failure::Journal)?;
     }
     Ok(())
 }

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use clap::Args;
 use regrind::config::CellConfig;
+use regrind::formats::run_files::RunFile;
 use regrind::recipe::Recipe;
 use regrind::record::begin_of;
 use regrind::setup;
@@ -167,9 +168,9 @@ fn planned(run: &Path) -> Option<Vec<[f64; 2]>> {
     let begin = begin_of(run).ok()?;
     let start = begin.content.part()?;
     let from = PathBuf::from(start.working_folder.as_ref()?);
-    let text = |name: &str| std::fs::read_to_string(run.join(name)).ok();
-    let recipe = Recipe::parse(&from.join(start.recipe.as_ref()?), &text("recipe.toml")?).ok()?;
-    let cell = CellConfig::parse(&from.join(start.cell.as_ref()?), &text("cell.toml")?).ok()?;
+    let text = |file: RunFile| std::fs::read_to_string(run.join(file.name())).ok();
+    let recipe = Recipe::parse(&from.join(start.recipe.as_ref()?), &text(RunFile::Recipe)?).ok()?;
+    let cell = CellConfig::parse(&from.join(start.cell.as_ref()?), &text(RunFile::Cell)?).ok()?;
     let (task, _) = setup::prepare(&recipe, &cell).ok()?;
     Some(task.targets.iter().map(|target| [target.point.x, target.point.y]).collect())
 }

@@ -11,6 +11,7 @@ use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, FurtherTouches, Jud
 use regrind::document::visible;
 use regrind::drive::{CycleRow, Notice, PreviewStatistics};
 use regrind::formats::read_error_map;
+use regrind::formats::run_files::{CycleFile, CycleFolder};
 use regrind::model::FIRST_BATCH;
 use regrind::recipe::{Recipe, SelectionMode};
 use regrind::report::in_air;
@@ -301,14 +302,13 @@ impl Show {
 /// repeated measurements (`attempt-2` and higher), then in the cycle folder, and then in the folders of the batches of
 /// touches. Returns `None` if there is no error map.
 fn newest_map(run: &Path, cycle: u32) -> Option<PathBuf> {
-    let cycle = run.join(format!("cycle-{cycle}"));
-    let of = |what: &str, first: u32| {
-        let folders = (first..).map(|k| cycle.join(format!("{what}-{k}"))).take_while(|folder| folder.is_dir());
+    let existing = |folder: &dyn Fn(u32) -> CycleFolder| {
+        let folders = (1..).map(|k| run.join(folder(k).to_string())).take_while(|folder| folder.is_dir());
         folders.collect::<Vec<_>>()
     };
-    let (batches, attempts) = (of("batch", 1), of("attempt", 2));
-    let all = batches.into_iter().chain([cycle.clone()]).chain(attempts);
-    let maps = all.map(|folder| folder.join("error_map.csv"));
+    let batches = existing(&|batch| CycleFolder::Batch { cycle, batch });
+    let attempts = existing(&|attempt| CycleFolder::Attempt { cycle, attempt });
+    let maps = batches.into_iter().chain(attempts).map(|folder| folder.join(CycleFile::ErrorMap.name()));
     maps.rev().find(|map| map.is_file())
 }
 

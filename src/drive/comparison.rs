@@ -25,8 +25,6 @@ const TEXTS: [&str; 16] = [
     "why",
     "words",
 ];
-/// Table of figures. Its columns `removed`, `direction`, `cut_off` and `made` are texts for people.
-const FIGURES_TABLE: &str = "form.csv";
 
 /// Returns true if two commands in JSON are equal. Ignores the keys of texts for people ([`COMMAND_TEXTS`]), such as
 /// the reason and the remedy.
@@ -66,9 +64,8 @@ fn are_equal(one: &Value, other: &Value, is_text: bool) -> bool {
 }
 
 /// Returns true if the contents `one` and `other` of two files are equal, apart from texts for people and the version
-/// of the program. `name` is the name of both files. The name selects the comparison: JSON values for `.json`, rows of
-/// a table for [`FIGURES_TABLE`], and lines of text for every other file. Returns false if the contents differ and one
-/// of them is not UTF-8.
+/// of the program. `name` is the name of both files. The name selects the comparison: JSON values for `.json`, and lines
+/// of text for every other file. Returns false if the contents differ and one of them is not UTF-8.
 pub(super) fn is_same_file(name: &str, one: &[u8], other: &[u8]) -> bool {
     if one == other {
         return true;
@@ -85,13 +82,8 @@ pub(super) fn is_same_file(name: &str, one: &[u8], other: &[u8]) -> bool {
         return one.zip(other).is_some_and(|(one, other)| is_same_result(&one, &other));
     }
     let [one, other] = [one, other].map(|text| text.lines().map(without_version).collect::<Vec<_>>());
-    let is_figures_table = name.rsplit('/').next() == Some(FIGURES_TABLE);
     one.len() == other.len()
-        && one.iter().zip(&other).all(|(one, other)| {
-            one == other
-                || is_figures_table && is_same_row(one, other)
-                || [one, other].iter().all(|line| is_remark(line))
-        })
+        && one.iter().zip(&other).all(|(one, other)| one == other || is_remark(one) && is_remark(other))
 }
 
 /// Returns a line of a tool path without the version of the program. Changes only lines such as `Regrind 1.2.3 tool
@@ -102,25 +94,6 @@ fn without_version(line: &str) -> String {
         (!version.contains(' ')).then(|| format!("{before}Regrind tool path{rest}"))
     });
     version.unwrap_or_else(|| line.to_owned())
-}
-
-/// Returns true if two rows of a table have equal fields. Two different fields count as equal if both contain a space,
-/// because they are then texts for people.
-fn is_same_row(one: &str, other: &str) -> bool {
-    let [one, other] = [one, other].map(fields);
-    let is_text = |field: &str| field.trim().contains(' ');
-    one.len() == other.len()
-        && one.iter().zip(&other).all(|(one, other)| one == other || is_text(one) && is_text(other))
-}
-
-/// Splits a row of a table at the commas outside of quotes.
-fn fields(row: &str) -> Vec<&str> {
-    let mut is_quoted = false;
-    row.split(|c: char| {
-        is_quoted ^= c == '"';
-        c == ',' && !is_quoted
-    })
-    .collect()
 }
 
 /// Returns true if a line of a file is a comment about a compensated machine parameter. Such a line begins with a
@@ -200,10 +173,7 @@ mod tests {
             ),
             ("c/correction.csv", "# part: a b\n1,2\n", "# part: a c\n1,2\n", false),
             ("c/correction.csv", "1,2\n", "1,2\n1,2\n", false),
-            ("c/form.csv", "RMS,0.1,um,\"a, b\",of all\n", "RMS,0.1,um,\"a c\",of each point\n", true),
-            ("c/form.csv", "RMS,0.1,um,\"a, b\"\n", "RMS,0.2,um,\"a, b\"\n", false),
-            ("c/form.csv", "RMS,0.1,um,a b\n", "RMS,0.1,um,a\n", false),
-            ("c/deviations.csv", "1,a b\n", "1,a c\n", false),
+            ("c/form.csv", "1,2,0.1,a b\n", "1,2,0.1,a c\n", false),
             ("c/f.json", r#"{"program":{"version":"0.1.0"},"a":1}"#, r#"{"program":{"version":"0.2.0"},"a":1}"#, true),
             ("c/f.json", r#"{"version":"0.1.0"}"#, r#"{"version":"0.2.0"}"#, false),
             ("c/f.json", "{", "}", false),

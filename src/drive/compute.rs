@@ -6,7 +6,7 @@ use tokio::task::JoinError;
 
 use super::Drive;
 use super::Task;
-use super::computation::{Computation, batch_folder, create_folder, cycle_folder};
+use super::computation::{Computation, create_folder};
 use super::evaluation;
 use super::failure::{failure_message, panic_message};
 use super::notice::Notice;
@@ -16,6 +16,7 @@ use super::running_computations::ComputationResult;
 use super::task::ComputationProduct;
 use crate::cell::{CompensationRefusal, Event, GateFailure, GateResult};
 use crate::device::{BatchId, Measurement};
+use crate::formats::run_files::CycleFolder;
 
 impl Drive {
     /// Starts the gate of a measurement: the check whether its points can be used. Also writes the points to files.
@@ -63,12 +64,12 @@ impl Drive {
         let attempt = self.computations.attempts.entry((cycle, kind)).or_insert(0);
         *attempt += 1;
         let which = *attempt;
-        let mut files = OutputFiles::new(folder.clone(), cycle_folder(cycle, which));
+        let mut files = OutputFiles::new(folder.clone(), CycleFolder::Attempt { cycle, attempt: which }.to_string());
         if task.adaptive.is_some() && kind != Computation::Compensation {
             let settled =
                 self.computations.attempts.get(&(cycle, Computation::FinalRegistration)).map_or(1, |before| before + 1);
-            files = OutputFiles::new(folder.clone(), batch_folder(cycle, which))
-                .with_final_subfolder(cycle_folder(cycle, settled));
+            files = OutputFiles::new(folder.clone(), CycleFolder::Batch { cycle, batch: which }.to_string())
+                .with_final_subfolder(CycleFolder::Attempt { cycle, attempt: settled }.to_string());
         }
         let computing = self.computations.executor.spawn_computation(&mut self.computations.running, move || {
             // A failure to create the folder shows as the error of the first file in it.

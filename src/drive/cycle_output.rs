@@ -11,6 +11,7 @@ use crate::compensation::{
     SurfacePoint,
 };
 use crate::form::{FormOptions, RemovedParts, compute_figures, slope};
+use crate::formats::run_files::CycleFile;
 use crate::formats::{
     ErrorMapOrigin, FormatError, write_error_map, write_error_map_x3p, write_figures, write_json_atomic,
 };
@@ -40,7 +41,7 @@ pub(super) fn save_figures(
     let slopes = map.map(|map| slope(&map.grid, &map.values_mm, &map.valid, integration_mm));
     let slopes = slopes.as_ref().map(Result::as_ref);
     write_figures(
-        &files.add_file("figures.json"),
+        &files.add_file(CycleFile::Figures),
         (made.as_ref(), slopes, form),
         &removed_components(task),
         task.simulation,
@@ -91,7 +92,7 @@ pub(super) fn save_parameters(
     cycle: &CycleState,
     contacts: &[SurfacePoint],
 ) -> Result<Option<ParameterEstimation>, FormatError> {
-    let path = files.add_file("parameters.json");
+    let path = files.add_file(CycleFile::Parameters);
     let options = task.parameter_options(cycle.correction.parameters.as_ref());
     match compensation::estimate_parameters(contacts, None, &options) {
         Ok(told) => write_json_atomic(path, &parameter_document(task, &told)).map(|()| Some(told)),
@@ -183,8 +184,8 @@ pub(super) fn save_error_map(
     let ground_with = (!cycle.correction.is_zero()).then(|| task.map_identity(&cycle.correction));
     let origin = ErrorMapOrigin { part: task.part_identity, cycle: number, ground_with };
     let date = utc_to_the_second(SystemTime::now());
-    write_error_map(&files.add_file("error_map.csv"), map, &origin, task.simulation)
-        .and_then(|()| write_error_map_x3p(&files.add_file("error_map.x3p"), map, &date, task.simulation))
+    write_error_map(&files.add_file(CycleFile::ErrorMap), map, &origin, task.simulation)
+        .and_then(|()| write_error_map_x3p(&files.add_file(CycleFile::ErrorMapX3p), map, &date, task.simulation))
         .map_err(classify_error)?;
     save_pictures(task, files, map).and_then(|()| save_deviations(task, files, found)).map_err(classify_error)
 }
@@ -199,8 +200,8 @@ fn save_pictures(task: &Task, files: &mut OutputFiles, map: &ErrorMap) -> Result
     if let Some(tolerance_mm) = task.plot_tolerance_mm {
         picture = picture.with_tolerance(tolerance_mm)?;
     }
-    picture.save_svg(&files.add_file("error_map.svg"))?;
-    let pixels = files.add_file("error_map.png");
+    picture.save_svg(&files.add_file(CycleFile::ErrorMapSvg))?;
+    let pixels = files.add_file(CycleFile::ErrorMapPng);
     if task.simulation { picture.save_simulated_png(&pixels) } else { picture.save_png(&pixels) }
 }
 
@@ -208,5 +209,12 @@ fn save_deviations(task: &Task, files: &mut OutputFiles, found: &Registration) -
     let rows: Vec<[f64; 4]> =
         used_deviations(found).map(|d| [d.point.x, d.point.y, d.point.z, d.deviation_mm]).collect();
     let remarks: &[&str] = if task.simulation { &["SIMULATION", "frame: model"] } else { &["frame: model"] };
-    save_coloured_ply(&files.add_file("deviations.ply"), "Deviations", &rows, &[], task.plot_tolerance_mm, remarks)
+    save_coloured_ply(
+        &files.add_file(CycleFile::ColouredDeviations),
+        "Deviations",
+        &rows,
+        &[],
+        task.plot_tolerance_mm,
+        remarks,
+    )
 }

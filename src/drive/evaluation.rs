@@ -23,6 +23,7 @@ use crate::compensation::{
     self, ErrorMap, LearningState, ParameterCorrections, ParameterEstimation, SurfacePoint, error_map,
 };
 use crate::device::Coordinates;
+use crate::formats::run_files::CycleFile;
 use crate::formats::{FormatError, NominalInput, RegistrationDocument, save_form, save_registration};
 use crate::geometry::Point;
 use crate::model::{Form, ModelInputs, PartFit, Prior};
@@ -194,8 +195,8 @@ fn save_fit(
     }
     write_registration(task, files, found, options).map_err(classify_error)?;
     if let Ok(form) = &estimate.form {
-        for name in ["form.csv", "model.json"] {
-            files.add_file(name);
+        for file in [CycleFile::Form, CycleFile::Model] {
+            files.add_file(file);
         }
         save_form(&files.folder(), form, found, Some(task.simulation)).map_err(classify_error)?;
     }
@@ -331,10 +332,10 @@ fn write_registration(
 ) -> Result<(), FormatError> {
     let nominal =
         NominalInput { file: &task.nominal_path, points: task.nominal.len(), kind: task.nominal.kind().to_string() };
-    let mut document = RegistrationDocument::new(found, options, nominal, Path::new("measured.csv"));
+    let mut document = RegistrationDocument::new(found, options, nominal, Path::new(CycleFile::Measured.name()));
     document.simulation = Some(task.simulation);
-    for name in ["deviations.csv", "deviation_uncertainty.csv", "registration.json"] {
-        files.add_file(name);
+    for file in [CycleFile::Deviations, CycleFile::DeviationUncertainty, CycleFile::Registration] {
+        files.add_file(file);
     }
     save_registration(&files.folder(), &document, &found.deviations)
 }

@@ -6,7 +6,6 @@ use std::sync::Arc;
 use serde_json::{Value, json};
 
 use super::Drive;
-use super::computation::cycle_folder;
 use super::notice::Notice;
 use super::pipeline;
 use super::running_computations::ComputationResult;
@@ -14,7 +13,7 @@ use super::station::{MachinePayload, StationRequest};
 use super::task::ComputationProduct;
 use crate::cell::{Actor, Command, ComparedFigure, Device, Ending, Event, Judgement, RecordFailure};
 use crate::device::BatchId;
-use crate::formats::LEARNED;
+use crate::formats::run_files::{CycleFile, CycleFolder, RunFile};
 use crate::journal::{self};
 
 impl Drive {
@@ -113,10 +112,11 @@ impl Drive {
         if self.task.parameter_compensation.is_some() {
             result["parameters"] = json!(cycle.map(|cycle| pipeline::recorded_parameters(&self.task, cycle)));
         }
-        self.write_document(format!("{}/result.json", cycle_folder(number, which)), number, &result).await;
+        let folder = CycleFolder::Attempt { cycle: number, attempt: which };
+        self.write_document(format!("{folder}/{}", CycleFile::Judgement.name()), number, &result).await;
     }
 
-    /// Writes the learned state of this run to the file [`LEARNED`]. The next part of this kind can begin with this
+    /// Writes the learned state of this run to the file `learned.json`. The next part of this kind can begin with this
     /// state. Does nothing if the run was stopped or aborted, or if no cycle gives a usable state.
     pub(super) async fn save_learned(&mut self, ending: &Ending) {
         if !matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }) {
@@ -128,7 +128,7 @@ impl Drive {
         let Some(learned) = last.and_then(|cycle| pipeline::learned_state(&self.task, run, (&cycle, fields))) else {
             return;
         };
-        self.write_document(LEARNED.into(), self.cell.cycle(), &learned).await;
+        self.write_document(RunFile::Learned.name().into(), self.cell.cycle(), &learned).await;
     }
 }
 

@@ -57,6 +57,7 @@ use tokio::time::Instant;
 
 use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, Judgement, State, StateName};
 use crate::device::{AnyCmm, AnyGrinder, Cmm, Grinder};
+use crate::formats::run_files::RunFile;
 use crate::record::{EventDetail, PartEnd, RunEnd, TouchCounts};
 pub use blocking_executor::{BlockingExecutor, BlockingWork};
 use cycles::Cycles;
@@ -309,7 +310,7 @@ impl Drive {
             touches: touches.map(|[taken, whole_patterns]| TouchCounts { taken, whole_patterns }),
         }));
         let now = self.now();
-        self.write_document("result.json".into(), self.cell.cycle(), &result).await;
+        self.write_document(RunFile::Result.name().into(), self.cell.cycle(), &result).await;
         self.save_learned(&ending).await;
         if let Err(failure) = self.record.recorder.close(now, self.cell.cycle(), result).await {
             self.notify(Notice::RecordFailed { message: failure_message(&failure) });

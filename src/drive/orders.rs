@@ -145,7 +145,7 @@ impl Drive {
         let whole = hex(&identity);
         if digits.len() < 8 {
             return Err(
-                "give at least the first 8 digits of the map identity; the file correction.json has this identity"
+                "give at least the first 8 digits of the map identity; the file correction.csv has this identity"
                     .into(),
             );
         }

@@ -19,6 +19,7 @@ use crate::compensation::{
 };
 use crate::device::{Coordinates, Identified, MeasuredPoint, Measurement, Plan, PlanMismatch, TargetKind, TouchStatus};
 use crate::form::pv_998;
+use crate::formats::run_files::CycleFile;
 use crate::formats::{FormatError, Learned, ResultFolder, write_json_atomic, write_points};
 use crate::geometry::{Point, Vector};
 use crate::measuring::fit_sphere;
@@ -723,11 +724,6 @@ pub(super) fn learned_state(task: &Task, run: String, (cycle, fields): (&CycleSt
     )
 }
 
-/// Files of the conditions, the touches and the repeated touches of a measurement.
-pub(super) const CONDITIONS_FILE: &str = "measured.json";
-pub(super) const TOUCHES_FILE: &str = "touches.json";
-pub(super) const REPEATED_TOUCHES_FILE: &str = "touched_again.json";
-
 /// Number of rounds in which outliers of a measurement were touched again.
 #[derive(Serialize, Deserialize)]
 pub(super) struct RepeatedTouchesRecord {
@@ -757,24 +753,24 @@ pub(super) fn write_measured_points(
 ) -> Result<(), FormatError> {
     if let Some(temperature_c) = points.temperature_c.filter(|_| task.expansion.is_some()) {
         let conditions = MeasurementConditions { simulation: task.simulation, temperature_c };
-        write_json_atomic(files.add_file(CONDITIONS_FILE), &conditions)?;
+        write_json_atomic(files.add_file(CycleFile::Conditions), &conditions)?;
     }
     if points.repeat_rounds > 0 {
         let again = RepeatedTouchesRecord { simulation: task.simulation, rounds: points.repeat_rounds };
-        write_json_atomic(files.add_file(REPEATED_TOUCHES_FILE), &again)?;
+        write_json_atomic(files.add_file(CycleFile::RepeatedTouches), &again)?;
     }
     if !points.tried_targets.is_empty() {
         let (tried, of) = (points.tried_targets.clone(), points.point_targets.clone());
         write_json_atomic(
-            files.add_file(TOUCHES_FILE),
+            files.add_file(CycleFile::Touches),
             &TouchRecord { simulation: task.simulation, tried_targets: tried, point_targets: of },
         )?;
     }
     let header = if task.simulation { "# SIMULATION\nx_mm,y_mm,z_mm" } else { "x_mm,y_mm,z_mm" };
     if !points.sphere.is_empty() {
-        write_points(files.add_file("reference_sphere.csv"), header, &points.sphere)?;
+        write_points(files.add_file(CycleFile::ReferenceSphere), header, &points.sphere)?;
     }
-    write_points(files.add_file("measured.csv"), header, &points.part)
+    write_points(files.add_file(CycleFile::Measured), header, &points.part)
 }
 
 #[cfg(test)]

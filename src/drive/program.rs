@@ -14,16 +14,13 @@ use crate::formats::gcode::{
     Dialect, DialectError, Exactness, GcodeError, ProgramHeader, write_axis_table, write_program,
 };
 use crate::formats::result::read_bytes;
+use crate::formats::run_files::{CycleFile, tool_path_file};
 use crate::formats::write_atomic;
 use crate::geometry::Aperture;
 use crate::surface::Nominal;
 
 use super::recorder::OutputFiles;
 
-/// Name of the program file, without the extension, which the dialect defines. `TABLE_FILE` is the file for controllers
-/// that compensate by a table.
-pub(super) const PROGRAM_FILE: &str = "toolpath";
-const TABLE_FILE: &str = "toolpath_z.csv";
 /// Maximum number of points of a program that a run writes with each correction.
 const MAX_PROGRAM_POINTS: u64 = 3_000_000;
 
@@ -91,7 +88,7 @@ impl Programs {
     /// Returns the file name of the program of a pass. Its extension is defined by the dialect (the program language of
     /// the controller).
     pub(super) fn file_name(&self) -> String {
-        format!("{PROGRAM_FILE}.{}", self.dialect.dialect.extension)
+        tool_path_file(&self.dialect.dialect.extension)
     }
 
     /// Checks that the dialect (the program language of the controller) can express a program with these settings. The
@@ -205,12 +202,14 @@ impl Programs {
             }
             return Ok(Some(format!("{} was not written: {error}", self.file_name())));
         }
-        let file = files.add_file(&self.file_name());
+        let file = files.add_named(&self.file_name());
         self.write_program(&file, correction, map_identity, &path, &summary)?;
         self.copy_to_controller(&file, correction.cycle)?;
-        match self.save_table(&files.add_file(TABLE_FILE), correction, map_identity, &path) {
+        match self.save_table(&files.add_file(CycleFile::AxisTable), correction, map_identity, &path) {
             Ok(()) => Ok(None),
-            Err(ProgramError::Path(error)) => Ok(Some(format!("{TABLE_FILE} was not written: {error}"))),
+            Err(ProgramError::Path(error)) => {
+                Ok(Some(format!("{} was not written: {error}", CycleFile::AxisTable.name())))
+            }
             Err(error) => Err(error),
         }
     }

@@ -14,6 +14,7 @@ use tokio::sync::{mpsc, oneshot};
 
 use super::blocking_executor::{BlockingExecutor, BlockingWork};
 use crate::cell::RecordFailure;
+use crate::formats::run_files::CycleFile;
 use crate::formats::{FormatError, ResultFolder};
 use crate::journal::{Anchor, Artefact, Entry, Journal, JournalError, RecordKind};
 
@@ -341,7 +342,12 @@ impl OutputFiles {
     }
 
     /// Adds a file, which the caller is about to write, to the list of files of this computation. Returns its path.
-    pub(super) fn add_file(&mut self, name: &str) -> PathBuf {
+    pub(super) fn add_file(&mut self, file: CycleFile) -> PathBuf {
+        self.add_named(file.name())
+    }
+
+    /// Adds a file as [`OutputFiles::add_file`] does, but by its name.
+    pub(super) fn add_named(&mut self, name: &str) -> PathBuf {
         let name = if self.subfolder.is_empty() { name.to_owned() } else { format!("{}/{name}", self.subfolder) };
         let path = self.run_folder.join(&name);
         self.file_names.push(name);

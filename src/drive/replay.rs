@@ -23,7 +23,7 @@ use thiserror::Error;
 
 use super::Task;
 use super::comparison::{is_same_decision, is_same_file, is_same_result};
-use super::computation::{Computation, batch_folder, create_folder, cycle_folder};
+use super::computation::{Computation, create_folder};
 use super::cycles::Cycles;
 use super::evaluation;
 use super::pipeline;
@@ -32,6 +32,7 @@ use super::station::prepared_job;
 use super::task::ComputationProduct;
 use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, GateResult, Judgement};
 use crate::device::{Armed, BatchId, Coordinates, Identified, digest};
+use crate::formats::run_files::{CycleFile, CycleFolder};
 use crate::formats::{self, FormatError, ScratchFolder};
 use crate::journal::{Artefact, JournalError, Reader, Record, RecordKind, sha256_hex};
 use crate::record::{Content, EventDetail, EventRecord, StartIntent, TransferNote};
@@ -201,9 +202,9 @@ impl<'t> Replay<'t> {
     fn add_recorded_file(&mut self, file: Artefact) {
         self.recorded_names.insert(file.name.clone());
         let path = Path::new(&file.name);
-        let cycle = file.name.split('/').next().and_then(|folder| folder.strip_prefix("cycle-")?.parse().ok());
+        let cycle = CycleFolder::cycle_of(&file.name);
         let (Some(cycle), Some(name)) = (cycle, path.file_name().and_then(|name| name.to_str())) else { return };
-        if name == "result.json"
+        if name == CycleFile::Judgement.name()
             && self.replayed.unannounced_judgement.as_ref().is_some_and(|(_, of)| of.cycle == cycle)
         {
             self.replayed.unannounced_judgement = None;
@@ -293,7 +294,7 @@ impl<'t> Replay<'t> {
             return Ok(());
         }
         let scratch = ScratchFolder::at(self.run_folder.join(SCRATCH))?;
-        let mut files = OutputFiles::new(scratch.path().to_owned(), cycle_folder(number, 1));
+        let mut files = OutputFiles::new(scratch.path().to_owned(), CycleFolder::new(number).to_string());
         create_folder(&files.folder())?;
         let (again, product) = match kind {
             Computation::Registration => evaluation::register_cycle(
@@ -325,20 +326,20 @@ impl<'t> Replay<'t> {
     /// # Errors
     /// A file cannot be read, or the points do not pass the checks of a measurement.
     fn read_points(&self, number: u32) -> Result<super::task::UsablePoints, ReplayError> {
-        let read = |name: &str| match self.files.get(&(number, name.to_owned())) {
+        let read = |file: CycleFile| match self.files.get(&(number, file.name().to_owned())) {
             Some(file) => {
                 let bytes = file.read(self.run_folder)?;
                 formats::parse_points(self.run_folder.join(&file.name), &bytes[..]).map_err(ReplayError::from)
             }
             None => Ok(Vec::new()),
         };
-        let (part, sphere) = (read("measured.csv")?, read("reference_sphere.csv")?);
+        let (part, sphere) = (read(CycleFile::Measured)?, read(CycleFile::ReferenceSphere)?);
         let coordinates = self.coordinates.unwrap_or(Coordinates::Centres);
-        let conditions = self.read_json::<pipeline::MeasurementConditions>(number, pipeline::CONDITIONS_FILE)?;
+        let conditions = self.read_json::<pipeline::MeasurementConditions>(number, CycleFile::Conditions)?;
         let temperature_c = conditions.map(|told| told.temperature_c);
-        let touches = self.read_json::<pipeline::TouchRecord>(number, pipeline::TOUCHES_FILE)?;
+        let touches = self.read_json::<pipeline::TouchRecord>(number, CycleFile::Touches)?;
         let rounds = self
-            .read_json::<pipeline::RepeatedTouchesRecord>(number, pipeline::REPEATED_TOUCHES_FILE)?
+            .read_json::<pipeline::RepeatedTouchesRecord>(number, CycleFile::RepeatedTouches)?
             .map_or(0, |told| told.rounds);
         let touches = (touches, rounds);
         pipeline::gate_recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches).map_err(
@@ -350,10 +351,10 @@ impl<'t> Replay<'t> {
         )
     }
 
-    /// Reads the newest recorded JSON file `name` of cycle `number`. Returns `None` if no such file is recorded.
+    /// Reads the newest recorded JSON file `file` of cycle `number`. Returns `None` if no such file is recorded.
     /// Returns an error if the file cannot be read or has other content than expected.
-    fn read_json<T: DeserializeOwned>(&self, number: u32, name: &str) -> Result<Option<T>, ReplayError> {
-        let Some(file) = self.files.get(&(number, name.to_owned())) else { return Ok(None) };
+    fn read_json<T: DeserializeOwned>(&self, number: u32, file: CycleFile) -> Result<Option<T>, ReplayError> {
+        let Some(file) = self.files.get(&(number, file.name().to_owned())) else { return Ok(None) };
         let bytes = file.read(self.run_folder)?;
         serde_json::from_slice(&bytes).map(Some).map_err(|error| self.differs(format!("{}: {error}", file.name)))
     }
@@ -363,7 +364,7 @@ impl<'t> Replay<'t> {
     /// error for the first difference.
     fn compare_files(&self, number: u32, scratch: &Path, files: &OutputFiles) -> Result<(), ReplayError> {
         // A file of this format contains the time of its writing.
-        let dated = |name: &str| name.ends_with(".x3p");
+        let dated = |name: &str| name.ends_with(CycleFile::ErrorMapX3p.name());
         for name in files.file_names().iter().filter(|name| !dated(name)) {
             let path = scratch.join(name);
             let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
@@ -400,31 +401,41 @@ impl<'t> Replay<'t> {
         formats::finished_files(self.run_folder);
         for number in 1..=self.replayed.cell.cycle() + 1 {
             for attempt in 1.. {
-                let folder = cycle_folder(number, attempt);
-                let Some(names) = formats::finished_files(&self.run_folder.join(&folder)) else { break };
-                names.iter().for_each(|name| self.add_existing_file(&folder, number, attempt, name));
+                let folder = CycleFolder::Attempt { cycle: number, attempt };
+                let Some(names) = self.finished_files(folder) else { break };
+                names.iter().for_each(|name| self.add_existing_file(folder, name));
             }
             for batch in 1.. {
-                let folder = batch_folder(number, batch);
-                let Some(names) = formats::finished_files(&self.run_folder.join(&folder)) else { break };
-                names.iter().for_each(|name| self.add_existing_file(&folder, number, batch, name));
+                let folder = CycleFolder::Batch { cycle: number, batch };
+                let Some(names) = self.finished_files(folder) else { break };
+                names.iter().for_each(|name| self.add_existing_file(folder, name));
             }
         }
         Ok(self.replayed)
     }
 
-    /// Registers the file `name` that exists in `folder` of the run folder. Stores `attempt` as an attempt of the
-    /// computation that wrote the file. The next attempt then has a higher number and does not overwrite the file. A
-    /// file that is not recorded is added to the list of unrecorded files. Ignores hidden files and `result.json`.
-    fn add_existing_file(&mut self, folder: &str, number: u32, attempt: u32, name: &str) {
-        if name == "result.json" || name.starts_with('.') {
+    /// Returns the names of the files in `folder` of the run folder, or `None` if there is no such folder.
+    fn finished_files(&self, folder: CycleFolder) -> Option<Vec<String>> {
+        formats::finished_files(&self.run_folder.join(folder.to_string()))
+    }
+
+    /// Registers the file `name` that exists in `folder` of the run folder. Stores the number of the folder as an
+    /// attempt of the computation that wrote the file. The next attempt then has a higher number and does not overwrite
+    /// the file. A file that is not recorded is added to the list of unrecorded files. Ignores hidden files and
+    /// judgements.
+    fn add_existing_file(&mut self, folder: CycleFolder, name: &str) {
+        if name == CycleFile::Judgement.name() || name.starts_with('.') {
             return;
         }
+        let (number, attempt, is_batch) = match folder {
+            CycleFolder::Attempt { cycle, attempt } => (cycle, attempt, false),
+            CycleFolder::Batch { cycle, batch } => (cycle, batch, true),
+        };
         let kind = Computation::from_file_name(name).and_then(|kind| match kind {
             // If touches are chosen, the settled results are in the folders of the cycle, and their inputs in those of
             // its batches.
             Computation::Gate | Computation::Registration if self.task.adaptive.is_some() => {
-                if folder.contains("/batch-") {
+                if is_batch {
                     return Some(kind);
                 }
                 (kind == Computation::Registration).then_some(Computation::FinalRegistration)

@@ -11,6 +11,7 @@ use crate::compensation::{
 };
 use crate::device::{CarefulStart, Coordinates, CorrectionMap, Identified, Pass, Plan, PlanTarget, TargetKind};
 use crate::formats::gcode::GcodeError;
+use crate::formats::run_files::CycleFile;
 use crate::formats::{
     CellRun, CorrectionIdentities, FormatError, Learned, ResultFolder, SettingIdentity, write_correction,
 };
@@ -647,7 +648,7 @@ impl Task {
         let [identity, replaces] = [correction, base].map(|correction| self.map_identity(correction));
         let identities = CorrectionIdentities { part: self.part_identity, map: identity, replaces };
         let set = describe_parameter_corrections(correction, self.pass.wheel_radius_mm);
-        write_correction(&files.add_file("correction.csv"), correction, (&identities, &set), self.simulation)
+        write_correction(&files.add_file(CycleFile::Correction), correction, (&identities, &set), self.simulation)
     }
 
     /// Writes the program and the axis table for the pass with `correction` into `files`. The axis table contains the

@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::error::FormatError;
 use super::registration::{DeviationRow, write_column, write_deviations, write_json_atomic};
+use super::run_files::CycleFile;
 use regrind_core::geometry::Pose;
 use regrind_core::registration::{
     Deviation, Iteration, Loss, Method, PointStatus, Registration, RegistrationOptions, WeakDirection,
@@ -218,15 +219,15 @@ pub fn save_registration(
     let (rows, column) = rayon::join(
         || {
             let rows: Vec<DeviationRow> = deviations.par_iter().map(row).collect();
-            write_deviations(folder.join("deviations.csv"), &rows)
+            write_deviations(folder.join(CycleFile::Deviations.name()), &rows)
         },
         || {
             let column: Vec<f64> = deviations.iter().map(|d| d.uncertainty_mm).collect();
-            write_column(folder.join("deviation_uncertainty.csv"), "uncertainty_mm", &column)
+            write_column(folder.join(CycleFile::DeviationUncertainty.name()), "uncertainty_mm", &column)
         },
     );
     rows.and(column)?;
-    write_json_atomic(folder.join("registration.json"), document)
+    write_json_atomic(folder.join(CycleFile::Registration.name()), document)
 }
 
 fn row(deviation: &Deviation) -> DeviationRow {

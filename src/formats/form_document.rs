@@ -7,6 +7,7 @@ use serde::Serialize;
 use super::document::StandardUncertainty;
 use super::error::FormatError;
 use super::registration::{write_json_atomic, write_rows};
+use super::run_files::CycleFile;
 use regrind_core::model::{BudgetEntry, Form, FormPoint, Interval, IsoFigures, SlopeFigures};
 use regrind_core::registration::Registration;
 
@@ -99,8 +100,8 @@ pub fn save_form(
         },
         frame_covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
     };
-    write_json_atomic(folder.join("model.json"), &document)?;
+    write_json_atomic(folder.join(CycleFile::Model.name()), &document)?;
     let row = |of: &FormPoint| [of.place_mm[0], of.place_mm[1], of.form.mean_mm, of.form.sigma_mm];
     let rows: Vec<[f64; 4]> = form.points.iter().map(row).collect();
-    write_rows(&folder.join("form.csv"), FORM_HEADER, &rows, |row| (*row, None))
+    write_rows(&folder.join(CycleFile::Form.name()), FORM_HEADER, &rows, |row| (*row, None))
 }

@@ -6,14 +6,13 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::FormatError;
+use super::run_files::RunFile;
 use super::whole::read_whole;
 use regrind_core::compensation::{
     Correction, LearningState, MachineSimilarity, ParameterCorrections, TransferredState,
 };
 use regrind_core::model::PartPriors;
 
-/// Name of the file in a run folder.
-pub const LEARNED: &str = "learned.json";
 /// Maximum size of the file, in bytes; a larger file is not one of Regrind's.
 const MAX_BYTES: u64 = 256 << 20;
 
@@ -185,7 +184,7 @@ impl Learned {
         setting: &SettingIdentity,
         simulation: bool,
     ) -> Result<Option<(Self, Vec<u8>)>, LearnedError> {
-        let path = run.join(LEARNED);
+        let path = run.join(RunFile::Learned.name());
         let broken = |reason| LearnedError::Broken { path: path.clone(), reason };
         let text = match read_whole(&path, MAX_BYTES) {
             Ok(text) => text,
@@ -318,7 +317,7 @@ mod tests {
 
     fn read(text: &str) -> Result<Option<(Learned, Vec<u8>)>, LearnedError> {
         let folder = tempfile::tempdir().unwrap();
-        std::fs::write(folder.path().join(LEARNED), text).unwrap();
+        std::fs::write(folder.path().join("learned.json"), text).unwrap();
         Learned::read(folder.path(), &setting("a part"), true)
     }
 
@@ -409,7 +408,7 @@ mod tests {
             let all = [text.replacen(from, to, 1), text.replace(from, to)];
             all.map(|text| {
                 let error = read(&text).unwrap_err().to_string();
-                assert!(error.contains(LEARNED) && error.contains("archive"), "{error}");
+                assert!(error.contains("learned.json") && error.contains("archive"), "{error}");
                 error
             })
         };

@@ -30,6 +30,7 @@ pub mod references;
 pub mod registration;
 pub mod result;
 mod result_content;
+pub mod run_files;
 pub mod sdf;
 pub mod stl;
 mod system;
@@ -51,7 +52,7 @@ pub use folder::{ResultFolder, ScratchFolder, finished_files, remove_socket};
 pub use form_document::save_form;
 pub use height_map::HeightMap;
 pub use jsonl_appender::JsonlAppender;
-pub use learned::{CellRun, KnowledgeOrigin, LEARNED, Learned, LearnedError, SettingIdentity};
+pub use learned::{CellRun, KnowledgeOrigin, Learned, LearnedError, SettingIdentity};
 pub use map::{
     CorrectionIdentities, ErrorMapOrigin, MapNode, parse_error_map, read_error_map, write_correction, write_error_map,
 };

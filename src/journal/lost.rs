@@ -45,14 +45,6 @@ pub fn may_be_lost(folder: &Path) -> Result<Option<String>, JournalError> {
     Ok(damage(&bytes).map(|what| format!("{DATABASE}-wal is damaged: {what}")))
 }
 
-/// Returns the highest cycle number N for which the run folder contains a file or folder named `cycle-N`. Returns 0 if
-/// there is none, or if the folder cannot be read.
-pub fn newest_cycle(folder: &Path) -> u32 {
-    let names = fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.file_name());
-    let number = |name: std::ffi::OsString| name.to_str()?.strip_prefix("cycle-")?.parse().ok();
-    names.filter_map(number).max().unwrap_or(0)
-}
-
 /// Checks `log`, the content of a write-ahead log of SQLite. Returns a message if the header of the log is invalid, or
 /// if changes that were already on the disk follow an invalid frame: SQLite cannot read these changes any more. Returns
 /// `None` if all frames are valid, or if only the end of the log is invalid, as after a power failure.
@@ -184,15 +176,5 @@ mod tests {
         assert!(may_be_lost(&folder).unwrap().unwrap().contains("-wal is missing or empty"));
         fs::remove_file(folder.join(ANCHOR)).unwrap();
         assert!(may_be_lost(&folder).unwrap().unwrap().contains("journal.anchor is missing"));
-    }
-
-    #[test]
-    fn newest_cycle_by_number() {
-        let home = tempfile::tempdir().unwrap();
-        assert_eq!(newest_cycle(home.path()), 0);
-        for name in ["cycle-2", "cycle-10", "cycle-x", "other-30"] {
-            fs::create_dir(home.path().join(name)).unwrap();
-        }
-        assert_eq!(newest_cycle(home.path()), 10);
     }
 }

@@ -59,6 +59,11 @@ impl Reader {
     }
 }
 
+/// Returns true if the folder contains the database of a journal. Its content is not checked.
+pub fn has_record(folder: &Path) -> bool {
+    folder.join(DATABASE).is_file()
+}
+
 /// Modification time and length in bytes of the database and of its log. A stamp differs from an earlier one if a
 /// record was added in between.
 pub type Stamp = [Option<(SystemTime, u64)>; 2];

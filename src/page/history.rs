@@ -3,17 +3,13 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::SystemTime;
 
 use regrind_control::is_live;
-use regrind_report::{RunSummary, run_summary};
-
-/// Time of the last change and length of each file that changes with a record.
-type Stamp = [Option<(SystemTime, u64)>; 2];
+use regrind_report::{RecordStamp, RunSummary, has_record, record_stamp, run_summary};
 
 pub(crate) struct History {
     runs: PathBuf,
-    read: Mutex<HashMap<PathBuf, (Stamp, Arc<RunSummary>)>>,
+    read: Mutex<HashMap<PathBuf, (RecordStamp, Arc<RunSummary>)>>,
 }
 
 /// Run in the list.
@@ -36,7 +32,7 @@ impl History {
     pub(crate) fn folder(&self, id: &str) -> Option<PathBuf> {
         let plain = !id.is_empty() && !id.starts_with('.') && !id.contains(['/', '\\', '\0', ':']);
         let folder = self.runs.join(id);
-        (plain && folder.join("journal.sqlite").is_file()).then_some(folder)
+        (plain && has_record(&folder)).then_some(folder)
     }
 
     /// Returns the folders of the active runs: a program drives each of them. Blocks while it reads the disk.
@@ -63,8 +59,8 @@ impl History {
     /// Returns the summary of the run in `folder`. If the record of the run has not changed since the last call, takes
     /// the summary from the cache. Returns `None` if the record cannot be read. Blocks while it reads the disk.
     pub(crate) fn summary(&self, folder: &Path) -> Option<Arc<RunSummary>> {
-        let stamp = stamp(folder);
-        let kept = |read: &HashMap<PathBuf, (Stamp, Arc<RunSummary>)>| {
+        let stamp = record_stamp(folder);
+        let kept = |read: &HashMap<PathBuf, (RecordStamp, Arc<RunSummary>)>| {
             read.get(folder).filter(|(at, _)| *at == stamp).map(|(_, summary)| Arc::clone(summary))
         };
         if let Some(summary) = kept(&self.read.lock().unwrap_or_else(PoisonError::into_inner)) {
@@ -75,11 +71,4 @@ impl History {
         read.insert(folder.to_owned(), (stamp, Arc::clone(&summary)));
         Some(summary)
     }
-}
-
-fn stamp(folder: &Path) -> Stamp {
-    ["journal.sqlite", "journal.sqlite-wal"].map(|name| {
-        let metadata = std::fs::metadata(folder.join(name)).ok()?;
-        Some((metadata.modified().ok()?, metadata.len()))
-    })
 }

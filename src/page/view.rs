@@ -9,7 +9,8 @@ use axum::response::{IntoResponse, Redirect, Response};
 use maud::{DOCTYPE, Markup, html};
 use regrind_cell::{Alarm, Device, Role, StateName, Tolerance};
 use regrind_control::{JobProgress, NextStep, PreviewStatistics, Snapshot};
-use regrind_report::{AlarmHistory, ColourMap, CycleSummary, RUN_REPORT, RunResult, RunSummary};
+use regrind_formats::run_files::RunFile;
+use regrind_report::{AlarmHistory, ColourMap, CycleSummary, RunResult, RunSummary};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::task::spawn_blocking;
@@ -664,7 +665,8 @@ pub(crate) async fn compare(
 pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, headers: HeaderMap) -> Response {
     let Some(folder) = page.history.folder(&id) else { return not_here(PageSubject::Cell, &headers) };
     let read = spawn_blocking(move || {
-        std::fs::read(folder.join(RUN_REPORT)).or_else(|_| regrind_report::run_report(&folder).map(String::into_bytes))
+        std::fs::read(folder.join(RunFile::Report.name()))
+            .or_else(|_| regrind_report::run_report(&folder).map(String::into_bytes))
     });
     match read.await {
         Ok(Ok(html)) => {

@@ -5,7 +5,8 @@ use std::fs;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-use regrind_formats::{CellRun, LEARNED, Learned, SettingIdentity};
+use regrind_formats::run_files::RunFile;
+use regrind_formats::{CellRun, Learned, SettingIdentity};
 use regrind_journal::sha256_hex;
 use serde::Deserialize;
 use tokio_postgres::Row;
@@ -137,7 +138,7 @@ fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool
     if sha256_hex(&content) != digits(sha256) {
         return Err("it differs from the record".into());
     }
-    let place: PathBuf = [&from.cell, &from.run, LEARNED].iter().collect();
+    let place: PathBuf = [&from.cell, &from.run, RunFile::Learned.name()].iter().collect();
     let stated = SettingIdentity { id: kind.clone(), earlier: kind.clone() };
     let learned = Learned::read_other(&place, &content, &stated, simulation).map_err(|error| error.to_string())?;
     Ok(DeliveredResult { kind, is_own, from, learned })
@@ -163,10 +164,12 @@ fn bounded(path: &Path) -> io::Result<Vec<u8>> {
 pub(crate) async fn teach(link: &DatabaseLink, folder: &Path, id: i32) -> Result<Option<String>, PlantError> {
     let failed = refused("the learned error of a run");
     let text = "SELECT a.sha256 FROM run_artefact a WHERE a.run = $1 AND a.name = $2 AND NOT EXISTS (SELECT FROM lesson l WHERE l.run = $1)";
-    let Some(row) = link.client().query_opt(text, &[&id, &LEARNED]).await.map_err(&failed)? else { return Ok(None) };
+    let Some(row) = link.client().query_opt(text, &[&id, &RunFile::Learned.name()]).await.map_err(&failed)? else {
+        return Ok(None);
+    };
     let sha256: &[u8] = row.get(0);
     // A file that differs from its record was reported elsewhere, and is not used for learning.
-    let Ok(content) = fs::read(folder.join(LEARNED)) else { return Ok(None) };
+    let Ok(content) = fs::read(folder.join(RunFile::Learned.name())) else { return Ok(None) };
     if sha256_hex(&content) != digits(sha256) {
         return Ok(None);
     }

@@ -14,8 +14,9 @@ use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use regrind_formats::{LEARNED, ResultFolder, write_atomic};
-use regrind_journal::{DATABASE, Reader, Record, RecordKind, Stamp, sha256_hex, stamp};
+use regrind_formats::run_files::RunFile;
+use regrind_formats::{ResultFolder, write_atomic};
+use regrind_journal::{Reader, Record, RecordKind, Stamp, has_record, sha256_hex, stamp};
 use regrind_report::{RunResult, RunSummary, run_summary};
 use serde_json::{Value, json};
 use tokio_postgres::types::ToSql;
@@ -111,7 +112,7 @@ impl Replicator {
         let entries = fs::read_dir(&self.runs).into_iter().flatten().filter_map(Result::ok);
         let named = entries.filter_map(|entry| entry.file_name().into_string().ok());
         let mut open: Vec<(String, Stamp)> = named
-            .filter(|name| !name.starts_with('.') && self.runs.join(name).join(DATABASE).is_file())
+            .filter(|name| !name.starts_with('.') && has_record(&self.runs.join(name)))
             .map(|name| (stamp(&self.runs.join(&name)), name))
             .filter(|(at, name)| self.settled.get(name) != Some(at) && !self.skipped.contains_key(name))
             .map(|(stamp, name)| (name, stamp))
@@ -174,7 +175,7 @@ impl Replicator {
         shipped: &mut ReplicationResult,
     ) -> Result<(), PlantError> {
         if let Some(reason) = teach(link, folder, id).await?
-            && self.reported.insert((run.to_owned(), LEARNED.to_owned()))
+            && self.reported.insert((run.to_owned(), RunFile::Learned.name().to_owned()))
         {
             shipped.differ.push((run.to_owned(), reason));
         }
@@ -402,7 +403,7 @@ pub fn run_overview(folder: &Path) -> Result<Value, PlantError> {
 /// Returns the radius of the probe in mm, from the file `recipe.toml` in the run folder `folder`. Returns `None` if the
 /// file cannot be read or contains no radius.
 fn probe_of(folder: &Path) -> Option<f64> {
-    let recipe: toml::Table = fs::read_to_string(folder.join("recipe.toml")).ok()?.parse().ok()?;
+    let recipe: toml::Table = fs::read_to_string(folder.join(RunFile::Recipe.name())).ok()?.parse().ok()?;
     recipe.get("measure")?.get("probe_radius_mm")?.as_float()
 }
 

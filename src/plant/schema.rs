@@ -218,3 +218,15 @@ pub async fn retire_cell(link: &mut DatabaseLink, name: &str) -> Result<bool, Pl
     step.commit().await.map_err(&failed)?;
     Ok(true)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::MIGRATIONS;
+    use regrind_formats::run_files::RunFile;
+
+    #[test]
+    fn migration_names_learned_file() {
+        let name = format!("a.name = '{}'", RunFile::Learned.name());
+        assert!(MIGRATIONS.iter().any(|(_, text)| text.contains(&name)), "{name}");
+    }
+}

@@ -10,6 +10,7 @@ use serde_json::Value;
 use super::ReportError;
 use super::run_history::RunHistory;
 use regrind_cell::Device;
+use regrind_formats::run_files::CycleFile;
 use regrind_formats::{FormatError, escaped};
 
 /// Returns the HTML table of the machines, the wheel and the probe of a run. `story` is the history of the run from its
@@ -48,7 +49,7 @@ pub(super) fn equipment(story: &RunHistory, registration: Option<&Value>) -> Str
 /// be read or is not JSON.
 pub(super) fn last_model(story: &RunHistory, folder: &Path) -> Option<Value> {
     let registration = story.cycles.values().rev().find_map(|of| of.registration.as_ref())?;
-    let bytes = fs::read(folder.join(registration).with_file_name("model.json")).ok()?;
+    let bytes = fs::read(folder.join(registration).with_file_name(CycleFile::Model.name())).ok()?;
     serde_json::from_slice(&bytes).ok()
 }
 

@@ -2,17 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use regrind_formats::run_files::RunFile;
 use regrind_formats::write_atomic;
 
 use super::results::Results;
 use super::run_history::RunHistory;
 use super::{ReportError, dfq, qif};
-
-/// File name of the results of a run as QIF 3.0, in the run folder.
-pub const RUN_QIF: &str = "results.qif";
-
-/// File name of the results of a run as Q-DAS ASCII, in the run folder.
-pub const RUN_DFQ: &str = "results.dfq";
 
 /// File formats of the results of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -31,10 +26,10 @@ pub enum ResultsFormat {
 /// written.
 pub fn write_run_results(folder: &Path, format: ResultsFormat, path: Option<&Path>) -> Result<PathBuf, ReportError> {
     let usual = match format {
-        ResultsFormat::Qif => RUN_QIF,
-        ResultsFormat::Dfq => RUN_DFQ,
+        ResultsFormat::Qif => RunFile::QifResults,
+        ResultsFormat::Dfq => RunFile::DfqResults,
     };
-    let path = path.map_or_else(|| folder.join(usual), Path::to_path_buf);
+    let path = path.map_or_else(|| folder.join(usual.name()), Path::to_path_buf);
     write_atomic(&path, run_results(folder, format)?.as_bytes())?;
     Ok(path)
 }

@@ -14,12 +14,10 @@ use super::maps::{maps, within_html};
 use super::run_history::{Measurement, PassHistory, RunHistory};
 use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
 use regrind_cell::{ComparedFigure, Conformity, Ending, Figures, JobResult, RecordedParameter, Tolerance};
+use regrind_formats::run_files::RunFile;
 use regrind_formats::{escaped, write_atomic};
 use regrind_journal::Verified;
 use regrind_record::TouchCounts;
-
-/// File name of the report in a run folder.
-pub const RUN_REPORT: &str = "report.html";
 
 const STYLE: &str = "body{font:15px/1.45 Helvetica,Arial,sans-serif;color:#222;max-width:62em;margin:2em auto;padding:0 1em}\
 h1{font-size:1.6em;margin:0}h2{font-size:1.15em;margin:2em 0 .5em}table{border-collapse:collapse}\
@@ -42,7 +40,7 @@ td,th{padding:.2em .5em}}";
 /// Fails if the record is missing or does not pass verification, if a file on record cannot be read, or if the report
 /// cannot be written.
 pub fn write_run_report(folder: &Path) -> Result<PathBuf, ReportError> {
-    let path = folder.join(RUN_REPORT);
+    let path = folder.join(RunFile::Report.name());
     write_atomic(&path, run_report(folder)?.as_bytes())?;
     Ok(path)
 }

@@ -9,20 +9,9 @@ use regrind_cell::{
     Alarm, Command, Device, Ending, Event, Figures, GateResult, JobResult, Judgement, Reconciliation,
     RecordedParameter, Tolerance,
 };
+use regrind_formats::run_files::{CycleFile, CycleFolder};
 use regrind_journal::{Reader, Record, RecordKind, Verified, verify};
 use regrind_record::{Begin, Content, EventDetail, EventRecord, PartEnd, RunContent, RunEnd, TouchCounts};
-
-/// File of the error map of a cycle, as text.
-const MAP: &str = "error_map.csv";
-
-/// File of the points of a cycle with their deviations, as text.
-const DEVIATIONS: &str = "deviations.csv";
-
-/// File of the registration of a cycle.
-const REGISTRATION: &str = "registration.json";
-
-/// File of the figures of a cycle.
-const FIGURES: &str = "figures.json";
 
 #[derive(Default)]
 pub(super) struct RunHistory {
@@ -262,17 +251,17 @@ impl RunHistory {
 
     fn add_file(&mut self, record: &Record, name: &str) {
         // Results computed again after an interruption are in a separate folder. The last ones count.
-        if !name.starts_with(&format!("cycle-{}/", record.cycle)) {
+        if CycleFolder::cycle_of(name) != Some(record.cycle) {
             return;
         }
-        if name.ends_with(&format!("/{MAP}")) {
-            self.cycle(record.cycle).map = Some((name.to_owned(), record.utc.clone()));
-        } else if name.ends_with(&format!("/{DEVIATIONS}")) {
-            self.cycle(record.cycle).deviations = Some(name.to_owned());
-        } else if name.ends_with(&format!("/{REGISTRATION}")) {
-            self.cycle(record.cycle).registration = Some(name.to_owned());
-        } else if name.ends_with(&format!("/{FIGURES}")) {
-            self.cycle(record.cycle).form = Some(name.to_owned());
+        let file = name.rsplit('/').next().and_then(CycleFile::from_name);
+        let name = name.to_owned();
+        match file {
+            Some(CycleFile::ErrorMap) => self.cycle(record.cycle).map = Some((name, record.utc.clone())),
+            Some(CycleFile::Deviations) => self.cycle(record.cycle).deviations = Some(name),
+            Some(CycleFile::Registration) => self.cycle(record.cycle).registration = Some(name),
+            Some(CycleFile::Figures) => self.cycle(record.cycle).form = Some(name),
+            _ => {}
         }
     }
 

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 use regrind::drive::{Request, is_live};
-use regrind::journal::{DATABASE, Reader, Stamp, is_driven, stamp};
+use regrind::journal::{Reader, Stamp, has_record, is_driven, stamp};
 use regrind::record::{Begin, RunContent};
 use regrind::report::{RunResult, RunSummary, run_summary};
 use regrind_live::{CellStatus, EndedRun, RunStatus};
@@ -108,13 +108,13 @@ impl CellMonitor {
             (self.status, self.silent) = (CellStatus::default(), None);
             return;
         }
-        if let Some(begins) = folders.iter().find(|run| !run.join(DATABASE).is_file() && is_driven(run)) {
+        if let Some(begins) = folders.iter().find(|run| !has_record(run) && is_driven(run)) {
             return self.does_not_answer(begins.clone());
         }
         let last = folders.iter().filter_map(|run| Some((self.last_recorded(run)?, run))).max();
         let Some((_, run)) = last else {
             // A folder without files is not a run. The state of an unreadable run is unknown.
-            match folders.iter().find(|run| run.join(DATABASE).is_file() && !self.known.contains_key(*run)) {
+            match folders.iter().find(|run| has_record(run) && !self.known.contains_key(*run)) {
                 Some(run) if is_driven(run) => self.does_not_answer(run.clone()),
                 Some(run) => {
                     (self.status.run_status, self.silent) =

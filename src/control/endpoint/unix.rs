@@ -6,11 +6,9 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use regrind_cell::Actor;
+use regrind_formats::run_files::RunFile;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::net::{UnixListener, UnixStream};
-
-/// File name of the socket in a run folder.
-const SOCKET_FILE: &str = "control.sock";
 
 /// Data from an accepted client.
 pub(crate) type ClientReader = OwnedReadHalf;
@@ -165,7 +163,7 @@ fn own_uid() -> Option<u32> {
 }
 
 fn socket_path(folder: &Path) -> PathBuf {
-    folder.join(SOCKET_FILE)
+    folder.join(RunFile::ControlSocket.name())
 }
 
 /// Returns true if a process listens on the control socket of the run folder `folder`, even if this process does not

@@ -23,6 +23,11 @@ use regrind_formats::FormatError;
 use regrind_formats::references::{References, parse_references, read_references};
 use regrind_formats::result::{Content, Coordinates, ResultFile, parse_result, read_bytes, read_statements};
 
+/// Name of the table of the targets in a hand-over.
+const PLAN_TABLE: &str = "plan.csv";
+/// Name of the file with the settings of the plan in a hand-over.
+const PLAN_DOCUMENT: &str = "plan.json";
+
 /// Settings of the file exchange with a measuring machine.
 #[derive(Clone, Debug)]
 pub struct CmmExchange {
@@ -208,7 +213,7 @@ impl CmmFolders {
             targets = match &plan {
                 Some(plan) => plan.targets.iter().map(|target| target.index).collect(),
                 None => {
-                    let path = stored.path.join("plan.csv");
+                    let path = stored.path.join(PLAN_TABLE);
                     parse_result(&path, &read_bytes(&path)?, &Content::default())?.indices.unwrap_or_default().into()
                 }
             };
@@ -617,8 +622,8 @@ impl Exchange for CmmFolders {
         let ticket = HandOverHeader::new(part, job, sequence, &order.plan_identity, order.plan.probe_radius_mm, inbox)?;
         let expects = self.judge.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
         let mut files = vec![
-            ("plan.csv", plan_csv(&ticket.part, job, &ticket.identity, &order.plan).into_bytes()),
-            ("plan.json", plan_json(&ticket, order, &self.judge.settings, expects.as_str())),
+            (PLAN_TABLE, plan_csv(&ticket.part, job, &ticket.identity, &order.plan).into_bytes()),
+            (PLAN_DOCUMENT, plan_json(&ticket, order, &self.judge.settings, expects.as_str())),
         ];
         if let (Some(sensor), Some(coordinates)) =
             (&self.judge.settings.dmis_sensor, self.judge.settings.content.coordinates)
@@ -694,8 +699,8 @@ fn stored_plan(folder: &Path) -> Result<Plan, ExchangeError> {
         safe_height_mm: f64,
     }
     let Stored { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm } =
-        read_json(&folder.join("plan.json"))?;
-    let path = folder.join("plan.csv");
+        read_json(&folder.join(PLAN_DOCUMENT))?;
+    let path = folder.join(PLAN_TABLE);
     let bytes = read_bytes(&path)?;
     let text = String::from_utf8_lossy(&bytes);
     let rows = text.lines().zip(1..).filter(|(row, _)| !row.starts_with('#')).skip(1);

@@ -18,12 +18,13 @@ use super::target_list::TargetList;
 use crate::error::{DeviceError, DeviceResult};
 use crate::file_exchange::plan_csv;
 use crate::handshake::{
-    Answer, Armed, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation, Outcome, Reconciled,
-    Started, Status, digest, hex,
+    Answer, Armed, BatchId, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation, Outcome,
+    Reconciled, Started, Status, digest, hex,
 };
 use crate::job_memory::JobMemory;
 use crate::machine::{Cmm, Interrupt, Machine};
 use crate::payload::{Identified, Measurement, Plan, PreliminaryPoints};
+use regrind_formats::run_files::{self, CycleFolder};
 use regrind_formats::{FormatError, JsonlAppender, ResultFolder, write_atomic};
 
 /// Measuring machine that prints a line for each hit.
@@ -202,18 +203,13 @@ fn status_of(session: &MeasurementSession) -> Status {
 
 /// Returns the path of the list of targets of a job, relative to the folder of its run.
 fn plan_file(job: Job) -> String {
-    format!("cycle-{}/plan{}.csv", job.batch_id().cycle, batch_suffix(job))
+    let BatchId { cycle, batch } = job.batch_id();
+    format!("{}/{}", CycleFolder::new(cycle), run_files::plan_file(batch))
 }
 
 fn hits_file(job: Job) -> String {
-    format!("cycle-{}/hits{}.jsonl", job.batch_id().cycle, batch_suffix(job))
-}
-
-fn batch_suffix(job: Job) -> String {
-    match job.batch_id().batch {
-        0 => String::new(),
-        before => format!("-{}", before + 1),
-    }
+    let BatchId { cycle, batch } = job.batch_id();
+    format!("{}/{}", CycleFolder::new(cycle), run_files::hits_file(batch))
 }
 
 /// Writes the targets of `plan` as a CSV file for `job` into the folder of the run. Then opens the JSON-lines file of

@@ -5,12 +5,11 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use regrind_formats::result::read_bytes;
+use regrind_formats::run_files::{CycleFolder, tool_path_file};
 use regrind_formats::write_atomic;
 
 use super::program::{FramedProgram, PROGRAM, ProgramInputs, ProgramRecord, RECORD, name_begins};
 
-/// File name of the program that a run writes with every correction.
-const PASS_PROGRAM_FILE: &str = "toolpath.ngc";
 /// Maximum size of a record in bytes; a longer file is not a record.
 const MAX_RECORD_BYTES: u64 = 1 << 16;
 
@@ -37,14 +36,12 @@ impl Folders {
     /// program must not be run.
     pub(super) fn newest(&self, map: &[u8; 32], rounds: u32) -> Result<FramedProgram, String> {
         let cycles = std::fs::read_dir(&self.run).map_err(|error| path_error(&self.run, &error))?;
-        let cycles =
-            cycles.flatten().filter_map(|entry| Some((cycle(&entry.path())?, entry.path().join(PASS_PROGRAM_FILE))));
+        let name = tool_path_file(PROGRAM);
+        let cycle = |folder: &Path| CycleFolder::cycle_of(folder.file_name()?.to_str()?);
+        let cycles = cycles.flatten().filter_map(|entry| Some((cycle(&entry.path())?, entry.path().join(&name))));
         let newest = cycles.filter(|(_, file)| file.is_file()).max_by_key(|(cycle, _)| *cycle);
         let (cycle, file) = newest.ok_or_else(|| {
-            format!(
-                "the run folder {} has no file {PASS_PROGRAM_FILE}: see the journal for the reason",
-                self.run.display()
-            )
+            format!("the run folder {} has no file {name}: see the journal for the reason", self.run.display())
         })?;
         self.framed(cycle, &file, map, rounds)
     }
@@ -112,11 +109,6 @@ impl Folders {
         }
         Ok(None)
     }
-}
-
-/// Returns the number in the name of a folder `cycle-N`, or `None` for another folder.
-fn cycle(folder: &Path) -> Option<u32> {
-    folder.file_name()?.to_str()?.strip_prefix("cycle-")?.parse().ok()
 }
 
 fn path_error(path: &Path, error: &io::Error) -> String {

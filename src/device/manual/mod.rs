@@ -22,11 +22,14 @@ use super::file_exchange::{
     ExchangeError, ResultRequirements, assemble_measurement, check_measurement, contradiction, file_word, plan_csv,
 };
 use super::{
-    Answer, Armed, Cmm, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt, Job,
-    Machine, MachineCommand, MachineKind, MachineState, Measurement, OperatorConfirmation, Outcome, Pass, PassRecord,
-    Plan, Reconciled, Started, Status, digest, hex,
+    Answer, Armed, BatchId, Cmm, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt,
+    Job, Machine, MachineCommand, MachineKind, MachineState, Measurement, OperatorConfirmation, Outcome, Pass,
+    PassRecord, Plan, Reconciled, Started, Status, digest, hex,
 };
 use regrind_formats::result::{Content, read_bytes};
+use regrind_formats::run_files::{
+    CycleFile, CycleFolder, is_machine_result_file, is_tool_path_file, machine_result_file, plan_file,
+};
 use regrind_formats::{FormatError, ResultFolder, write_atomic};
 
 pub use settings::ManualWire;
@@ -171,7 +174,7 @@ impl ManualMachine {
     }
 
     fn prompt_to_measure(&self, job: Job, plan: &Plan, confirm: &dyn Fn(&str) -> String) -> Vec<String> {
-        let (part, file) = (&self.settings.part, self.cycle_folder(job).join(plan_file(job)));
+        let (part, file) = (&self.settings.part, self.cycle_folder(job).join(plan_file(job.batch_id().batch)));
         let points = match self.settings.min_free_points {
             Some(least) => format!("at least {least} points"),
             None => format!("{} points of {}", plan.targets.len(), file.display()),
@@ -193,7 +196,8 @@ impl ManualMachine {
             return vec![ended, confirm("done")];
         }
         let folder = self.cycle_folder(Job { cycle: job.cycle.saturating_sub(1), ..job });
-        let there = find_program(&folder).or_else(|| Some(folder.join("correction.csv")).filter(|file| file.is_file()));
+        let there = find_program(&folder)
+            .or_else(|| Some(folder.join(CycleFile::Correction.name())).filter(|file| file.is_file()));
         let by = there.map_or("your own program".to_owned(), |file| file.display().to_string());
         let map = hex(&map[..4]);
         vec![
@@ -217,7 +221,7 @@ impl ManualMachine {
     }
 
     fn cycle_folder(&self, job: Job) -> PathBuf {
-        self.settings.run_folder.join(format!("cycle-{}", job.batch_id().cycle))
+        self.settings.run_folder.join(CycleFolder::new(job.batch_id().cycle).to_string())
     }
 
     // ---- what a person says -------------------------------------------------------------------------------------------------------
@@ -290,7 +294,7 @@ impl ManualMachine {
             return Err(self.not_accepted("no measurement is requested"));
         };
         let (settings, plan, taken) = (self.settings.clone(), Arc::clone(plan), self.accepted_files.clone());
-        let cycle_folder = self.cycle_folder(job);
+        let (BatchId { cycle, batch }, cycle_folder) = (job.batch_id(), self.cycle_folder(job));
         let read = tokio::task::spawn_blocking(move || {
             let bytes = read_bytes(&file)?;
             let sha256: [u8; 32] = Sha256::digest(&bytes).into();
@@ -300,7 +304,7 @@ impl ManualMachine {
             let measurement = read_measurement(&settings, &plan, job, done, &file, &bytes)?;
             // The bytes are stored unchanged, under a name that no other file of the cycle has.
             let extension = file.extension().map_or("txt".to_owned(), |e| file_word(&e.to_string_lossy()));
-            let name = format!("result{}.{extension}", batch_suffix(job));
+            let name = machine_result_file(batch, &extension);
             write_atomic(&cycle_folder.join(&name), &bytes)?;
             Ok((measurement, sha256, name))
         });
@@ -308,34 +312,16 @@ impl ManualMachine {
             read.await.map_err(|e| self.not_accepted(e))?.map_err(|e| self.not_accepted(e))?;
         self.accepted_files.push(sha256);
         self.measurement = Some(measurement);
-        let cycle = job.batch_id().cycle;
-        Ok(vec![format!("cycle-{cycle}/{}", plan_file(job)), format!("cycle-{cycle}/{name}")])
+        let folder = CycleFolder::new(cycle);
+        Ok(vec![format!("{folder}/{}", plan_file(batch)), format!("{folder}/{name}")])
     }
 }
 
-fn plan_file(job: Job) -> String {
-    format!("plan{}.csv", batch_suffix(job))
-}
-
-/// Returns the suffix of the file names of a batch of touches (a part of a measurement that is taken in several jobs).
-/// Returns an empty text for the first batch, `-2` for the second.
-fn batch_suffix(job: Job) -> String {
-    match job.batch_id().batch {
-        0 => String::new(),
-        before => format!("-{}", before + 1),
-    }
-}
-
-/// Returns true if a cycle folder of the run folder `run` contains a file named `result`, with any extension, whose
-/// content has this SHA-256. Such a file was accepted by an earlier process. Ignores the result files of later batches,
-/// for example `result-2`.
+/// Returns true if a cycle folder of the run folder `run` contains a file of a machine's result whose content has this
+/// SHA-256. Such a file was accepted by an earlier process.
 fn is_stored_result(run: &Path, sha256: &[u8; 32]) -> bool {
     let within = |folder: &Path| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    // The files of later batches have a suffix: see `batch_suffix`.
-    let is_result = |path: &Path| {
-        let stem = path.file_stem().and_then(|stem| stem.to_str()).and_then(|stem| stem.strip_prefix("result"));
-        stem.is_some_and(|suffix| suffix.is_empty() || suffix.starts_with('-'))
-    };
+    let is_result = |path: &Path| path.file_name().and_then(|name| name.to_str()).is_some_and(is_machine_result_file);
     let cycles = within(run).filter(|path| path.is_dir());
     let mut results = cycles.flat_map(|cycle| within(&cycle).filter(|path| is_result(path)).collect::<Vec<_>>());
     results.any(|path| read_bytes(&path).is_ok_and(|bytes| Sha256::digest(&bytes).as_slice() == sha256))
@@ -385,7 +371,7 @@ fn read_measurement(
 fn write_plan(settings: &ManualSettings, folder: &Path, plan: &Plan, job: Job) -> Result<(), FormatError> {
     ResultFolder::prepare(folder)?.keep();
     let text = plan_csv(&settings.part, job, &hex(&plan.identity()), plan);
-    write_atomic(&folder.join(plan_file(job)), text.as_bytes())
+    write_atomic(&folder.join(plan_file(job.batch_id().batch)), text.as_bytes())
 }
 
 impl Machine for ManualMachine {
@@ -557,8 +543,9 @@ impl Grinder for ManualMachine {
 /// extension. If there are several, returns the first in alphabetical order. Returns `None` if there is none.
 fn find_program(folder: &Path) -> Option<PathBuf> {
     let files = std::fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
-    let mut programs: Vec<PathBuf> =
-        files.filter(|file| file.is_file() && file.file_stem() == Some("toolpath".as_ref())).collect();
+    let mut programs: Vec<PathBuf> = files
+        .filter(|file| file.is_file() && file.file_name().and_then(|name| name.to_str()).is_some_and(is_tool_path_file))
+        .collect();
     programs.sort();
     programs.into_iter().next()
 }
