@@ -106,7 +106,7 @@ fn spline(bencher: Bencher, spacing_mm: f64) {
 fn correction(bencher: Bencher, spacing_mm: f64) {
     let options = MapOptions::new(CUTOFF_MM, spacing_mm);
     let error = error_map(&READINGS, &options).expect("a map");
-    let now = Correction::zero(error.grid, 0.06);
+    let now = Correction::zero(error.nodes.grid, 0.06);
     let begin = LearningState::new(GainRule::Wavelength, &options, [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM], None);
     let seen = PassObservation { correction: &now, error: &error, response: None, explained: None };
     let known = begin.updated(&seen);

@@ -75,7 +75,7 @@ fn x3p_read(bencher: Bencher, nodes: usize) {
 
 #[divan::bench(args = [6_400, 1_000_000], sample_count = 10)]
 fn picture(bencher: Bencher, nodes: usize) {
-    let map = error_map(nodes).samples_mm();
+    let map = error_map(nodes).nodes.samples_mm().collect::<Vec<_>>();
     let drawn = || HeatMap::of_lengths("map", "deviation", black_box(&map)).unwrap().with_tolerance(2e-4).unwrap();
     bencher.bench_local(|| drawn().to_svg().unwrap());
 }

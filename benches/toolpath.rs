@@ -149,7 +149,7 @@ fn from_deviations_to_a_program(bencher: Bencher) {
     let begin = LearningState::new(GainRule::Wavelength, &options, [100.0, 60.0], None);
     bencher.bench(|| {
         let error = error_map(black_box(&readings), &options).expect("a map");
-        let now = Correction::zero(error.grid, 0.06);
+        let now = Correction::zero(error.nodes.grid, 0.06);
         let known =
             begin.updated(&PassObservation { correction: &now, error: &error, response: None, explained: None });
         let step = now.next_pass(&error, &known, None, &limits).expect("a correction");

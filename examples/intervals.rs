@@ -14,8 +14,9 @@ use std::f64::consts::{PI, TAU};
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
+use regrind::figures::{Interval, statistics};
 use regrind::geometry::{Point, Pose};
-use regrind::model::{Form, Interval, ModelInputs};
+use regrind::model::{DecisionBounds, Form, ModelInputs};
 use regrind::registration::{Deviation, PointStatus, RegistrationOptions, Start, register};
 use regrind::surface::{Nominal, PlaneProjection};
 use regrind_sim::form::FormError;
@@ -116,20 +117,20 @@ fn main() {
     println!("{:18}{:>6}{:>27}{:>27}{:>27}{:>14}", "", "ratio", "RMS", "PV touched", "PV 99.8 % aperture", "accepted");
     for line in lines().into_iter().filter(|line| line.name.contains(&word)) {
         let of = |seed: usize| figures_and_intervals(&nominal, line, points, seed as u64);
-        let all: Vec<[(f64, Interval); 3]> = (0..parts).into_par_iter().filter_map(of).collect();
+        let all: Vec<[Estimated; 3]> = (0..parts).into_par_iter().filter_map(of).collect();
         print!("{:18}{:6}", line.name, line.ratio);
         for k in 0..3 {
-            let share = |is: &dyn Fn(&(f64, Interval)) -> bool| {
+            let share = |is: &dyn Fn(&Estimated) -> bool| {
                 100.0 * all.iter().filter(|of| is(&of[k])).count() as f64 / all.len() as f64
             };
-            let held = share(&|(truth, of)| (of.low_mm..=of.high_mm).contains(truth));
-            let above = share(&|(truth, of)| *truth > of.high_mm);
+            let held = share(&|(truth, of, _)| (of.low_mm..=of.high_mm).contains(truth));
+            let above = share(&|(truth, of, _)| *truth > of.high_mm);
             let width = median(all.iter().map(|of| of[k].1.high_mm - of[k].1.low_mm));
             let truth = median(all.iter().map(|of| of[k].0));
             print!("{held:9.1}{above:6.1}{:8.2}{:4}", width / truth.max(SCATTER_MM / 10.0), "");
         }
         let accepted = |k: usize| {
-            let is = |of: &&[(f64, Interval); 3]| of[k].1.acceptance_bound_mm <= of[k].0 / 1.05;
+            let is = |of: &&[Estimated; 3]| of[k].2.acceptance_mm <= of[k].0 / 1.05;
             100.0 * all.iter().filter(is).count() as f64 / all.len() as f64
         };
         println!("{:8.1}{:6.1}", accepted(0), accepted(2));
@@ -137,9 +138,7 @@ fn main() {
 }
 
 fn median(of: impl Iterator<Item = f64>) -> f64 {
-    let mut of: Vec<f64> = of.collect();
-    of.sort_by(f64::total_cmp);
-    of[of.len() / 2]
+    statistics::median(&mut of.collect::<Vec<f64>>()).expect("a part")
 }
 
 fn nominal() -> Nominal {
@@ -148,8 +147,11 @@ fn nominal() -> Nominal {
     Nominal::from_points(grid.into_iter().map(Point::from).collect(), PlaneProjection::Auto).expect("a surface")
 }
 
-/// Returns the true figures of a part and the intervals that were estimated for them.
-fn figures_and_intervals(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[(f64, Interval); 3]> {
+/// True figure of a part in mm, with its estimated interval and bounds.
+type Estimated = (f64, Interval, DecisionBounds);
+
+/// Returns the true figures of a part and what was estimated for them.
+fn figures_and_intervals(nominal: &Nominal, line: Line, points: usize, seed: u64) -> Option<[Estimated; 3]> {
     let mut rng = regrind_sim::rng(1_000_000 + seed);
     let shape = FreeForm::default();
     let places = places(line.pattern, points, &mut rng);
@@ -206,7 +208,8 @@ fn figures_and_intervals(nominal: &Nominal, line: Line, points: usize, seed: u64
     // No touched place is left out.
     let aperture = between[between.len() - 1 - left_out].max(left.max()) - between[left_out].min(left.min());
     let pv = left.max() - left.min();
-    Some([(rms, told.figures.rms), (pv, told.figures.pv), (aperture, told.figures.pv_998)])
+    let (figures, bounds) = (told.figures, told.bounds);
+    Some([(rms, figures.rms, bounds.rms), (pv, figures.pv, bounds.pv), (aperture, figures.pv_998, bounds.pv_998)])
 }
 
 fn places(pattern: Pattern, count: usize, rng: &mut Rng) -> Vec<[f64; 2]> {

@@ -20,6 +20,7 @@ use std::time::Instant;
 use nabo::{KDTree, NotNan};
 use nalgebra::{Matrix6, Vector6};
 use rayon::prelude::*;
+use regrind::figures::statistics::rms;
 use regrind::geometry::{Point, Pose, Twist, Vector, fit_rigid};
 use regrind::registration::{
     Deviation, Method, PointStatus, ProbeSide, Registration, RegistrationError, RegistrationOptions, Start, register,
@@ -81,11 +82,6 @@ fn nodes(columns: usize, rows: usize, [width, depth]: [f64; 2]) -> Vec<[f64; 2]>
 fn pv(values: impl Iterator<Item = f64>) -> f64 {
     let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
     high - low
-}
-
-fn rms(values: impl Iterator<Item = f64>) -> f64 {
-    let (sum, count) = values.fold((0.0, 0.0), |(s, n), v| (s + v * v, n + 1.0));
-    (sum / count).sqrt()
 }
 
 /// Draws figures 4 and 5: the surface, its slope and its Gaussian curvature.

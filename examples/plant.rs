@@ -215,5 +215,5 @@ async fn fill(
 }
 
 fn bytes_of(digits: &str) -> Vec<u8> {
-    (0..digits.len() / 2).map(|k| u8::from_str_radix(&digits[2 * k..2 * k + 2], 16).unwrap()).collect()
+    data_encoding::HEXLOWER.decode(digits.as_bytes()).unwrap()
 }

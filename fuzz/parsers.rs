@@ -27,7 +27,7 @@ use regrind::formats::{
     HeightMap, LIMIT_MM, Learned, X3pFile, parse_metropro, parse_ply, parse_points, parse_sdf, parse_stl, parse_x3p,
     read_error_map, references::parse_references,
 };
-use regrind::geometry::{Grid, Point};
+use regrind::geometry::{Grid, GridMap, Point};
 use regrind::journal::{Anchor, Reader, canonical_json, verify};
 use regrind::recipe::Recipe;
 use regrind::surface::DefinedSurface;
@@ -105,8 +105,9 @@ fn assert_map(file: &X3pFile) {
 }
 
 fn assert_heights(map: &HeightMap) {
-    assert!(map.grid.len() == map.heights_mm.len() && map.valid.len() == map.heights_mm.len());
-    assert!(map.heights_mm.iter().all(|v| v.is_finite()) && map.valid.contains(&true));
+    let GridMap { grid, values_mm, valid } = &map.heights;
+    assert!(grid.len() == values_mm.len() && valid.len() == values_mm.len());
+    assert!(values_mm.iter().all(|v| v.is_finite()) && valid.contains(&true));
     assert!(map.pv_mm() >= 0.0 && map.rms_mm() >= 0.0);
     assert_eq!(map.points().len(), map.measured_count());
     assert!(map.points().iter().all(|p| p.iter().all(|v| v.is_finite())));
@@ -229,9 +230,7 @@ pub fn program(bytes: &[u8]) -> bool {
     let plane = HeightField::spline(grid, &vec![0.0; grid.len()]);
     let nominal = TargetSurface::new(plane, &Correction::zero(grid, 0.0), 1.0).expect("finite values");
     let map = ProgramMap {
-        grid,
-        values_mm: values,
-        valid: vec![true; grid.len()],
+        nodes: GridMap::all_valid(grid, values),
         kind: MapKind::Correction,
         identity: [7; 32],
         part: None,
@@ -266,8 +265,8 @@ pub fn program_map(bytes: &[u8]) -> bool {
         assert!(nodes.iter().flat_map(|node| [node.error(), node.sigma()]).flatten().all(f64::is_finite));
     }
     let Ok(map) = read_program_map(&file) else { return false };
-    assert!(map.grid.is_valid() && map.grid.len() == map.values_mm.len());
-    assert!(map.values_mm.iter().all(|v| v.is_finite()));
+    assert!(map.nodes.grid.is_valid() && map.nodes.grid.len() == map.nodes.values_mm.len());
+    assert!(map.nodes.values_mm.iter().all(|v| v.is_finite()));
     true
 }
 

@@ -3,6 +3,7 @@
 use std::fmt;
 use std::time::Duration;
 
+use data_encoding::HEXLOWER;
 use serde::{Serialize, Serializer};
 
 use crate::command::{Answer, CommandFrame, State};
@@ -172,7 +173,7 @@ fn seconds<S: Serializer>(at: &Duration, to: S) -> Result<S::Ok, S::Error> {
 }
 
 fn digits<S: Serializer>(identity: &[u8; 32], to: S) -> Result<S::Ok, S::Error> {
-    to.collect_str(&identity.iter().map(|byte| format!("{byte:02x}")).collect::<String>())
+    to.serialize_str(&HEXLOWER.encode(identity))
 }
 
 impl EventLog {

@@ -25,6 +25,8 @@
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
+use data_encoding::HEXLOWER;
+
 use crate::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
 use crate::followed_surface;
 use crate::head::Head;
@@ -250,7 +252,7 @@ impl Programs {
     /// Returns a message if the folder cannot be read, if no program matches, or if the machine cannot execute the
     /// program.
     fn read_for_map(&self, identity: &[u8; 32]) -> Result<Program, String> {
-        let map: String = identity.iter().map(|byte| format!("{byte:02x}")).collect();
+        let map = HEXLOWER.encode(identity);
         let files = std::fs::read_dir(&self.folder).map_err(|error| format!("{}: {error}", self.folder.display()))?;
         let is_of_map = |text: &String| {
             let words: Vec<String> = text.lines().map(str::to_ascii_lowercase).collect();

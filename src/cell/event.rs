@@ -1,10 +1,11 @@
 //! Events: orders of people, facts from machines, results of computations. The cell gets all its information as events,
 //! so a run can be replayed from its journal.
 
-use serde::{Deserialize, Serialize};
 use std::fmt;
 
-use super::interval::RecordedInterval;
+use regrind_figures::{Forecast, FormFigures, PartResponse, number};
+use serde::{Deserialize, Serialize};
+
 use super::state::Device;
 
 /// Person, and the terminal or computer from which the order came.
@@ -176,7 +177,7 @@ pub enum Event {
     /// radius in the recipe. Answers `Qualify`.
     Qualified {
         cycle: u32,
-        #[serde(with = "super::number")]
+        #[serde(with = "number")]
         radius_error_mm: f64,
     },
     /// The measurement is registered. Answers `Register`.
@@ -359,26 +360,26 @@ pub enum GateFailure {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Figures {
     /// Peak to valley of the deviations.
-    #[serde(with = "super::number")]
+    #[serde(with = "number")]
     pub pv_mm: f64,
     /// Peak to valley of all deviations but the outermost 0.2 %. `None` if it was not computed.
-    #[serde(rename = "pv_robust_mm", default, with = "super::number::optional")]
+    #[serde(rename = "pv_robust_mm", default, with = "number::optional")]
     pub pv_998_mm: Option<f64>,
     /// Root mean square of the deviations.
-    #[serde(with = "super::number")]
+    #[serde(with = "number")]
     pub rms_mm: f64,
     /// Figures of the form of the part, without the noise of the probe. The cell judges these figures. `None` in
     /// records of earlier versions, in which the figures of the points are judged.
     #[serde(default)]
-    pub form: Option<RecordedFormFigures>,
+    pub form: Option<FormFigures>,
     /// Expanded measuring uncertainty (k = 2) of the peak to valley.
-    #[serde(with = "super::number")]
+    #[serde(with = "number")]
     pub pv_expanded_mm: f64,
     /// Expanded measuring uncertainty (k = 2) of the root mean square.
-    #[serde(with = "super::number")]
+    #[serde(with = "number")]
     pub rms_expanded_mm: f64,
     /// Share of the aperture that the measured points cover, 0 to 1.
-    #[serde(with = "super::number")]
+    #[serde(with = "number")]
     pub coverage: f64,
     /// Points used.
     pub points: u32,
@@ -389,10 +390,10 @@ pub struct Figures {
     #[serde(rename = "left_out", default, skip_serializing_if = "Option::is_none")]
     pub with_outliers: Option<Box<OutlierFigures>>,
     /// Distance of the part from its expected place.
-    #[serde(with = "super::number")]
+    #[serde(with = "number")]
     pub shift_mm: f64,
     /// Angle of the part from its expected orientation.
-    #[serde(rename = "turn_rad", with = "super::number")]
+    #[serde(rename = "turn_rad", with = "number")]
     pub rotation_rad: f64,
     /// Directions of the pose that the surface determines weakly, in words.
     pub weak_directions: Vec<String>,
@@ -404,7 +405,7 @@ pub struct Figures {
     #[serde(default)]
     pub forecast: Option<Forecast>,
     /// Maximum removal at any place since the run began. `None` if it is not known.
-    #[serde(default, with = "super::number::optional")]
+    #[serde(default, with = "number::optional")]
     pub removed_mm: Option<f64>,
     /// Number of contributions to the uncertainty without a stated value, and number of all contributions. A
     /// contribution without a stated value counts as 0. `None` if there is no uncertainty budget.
@@ -420,10 +421,10 @@ pub struct Figures {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct OutlierFigures {
     /// Peak to valley of the deviations.
-    #[serde(with = "super::number")]
+    #[serde(with = "number")]
     pub pv_mm: f64,
     /// Root mean square of the deviations.
-    #[serde(with = "super::number")]
+    #[serde(with = "number")]
     pub rms_mm: f64,
     /// Outliers: which points, where they are and how large their deviations are, in words.
     #[serde(rename = "places")]
@@ -444,80 +445,30 @@ pub struct FurtherTouches {
     pub reason: String,
 }
 
-/// Figures of the form of a part.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct RecordedFormFigures {
-    /// Peak to valley.
-    pub pv: RecordedInterval,
-    /// Peak to valley over the aperture: at the touched points and between them, without the outermost 0.1 % at each
-    /// end.
-    #[serde(rename = "pv_robust")]
-    pub pv_998: RecordedInterval,
-    /// Root mean square.
-    pub rms: RecordedInterval,
-    /// Standard deviation of the noise of a single point.
-    #[serde(rename = "scatter_mm", with = "super::number")]
-    pub noise_sigma_mm: f64,
-}
-
-/// Expected result of another pass.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Forecast {
-    /// Root mean square of the deviations.
-    #[serde(with = "super::number")]
-    pub rms_mm: f64,
-    /// Standard deviation of the expected rms.
-    #[serde(with = "super::number")]
-    pub sigma_mm: f64,
-    /// Lower bound of the rms that further corrections can reach, as estimated from the passes so far. `None` if it is
-    /// not known.
-    #[serde(default, with = "super::number::optional")]
-    pub floor_mm: Option<f64>,
-}
-
-/// Response of the part to the last map.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-#[non_exhaustive]
-pub enum PartResponse {
-    /// As expected.
-    Expected,
-    /// Unknown: the map was too small, or its effect too noisy.
-    Unclear,
-    /// In the opposite direction: the sign of the map is wrong.
-    SignFlipped,
-    /// As to a mirrored or turned map: the direction of an axis is wrong.
-    Mirrored,
-    /// No response.
-    NoEffect,
-    /// Twice the expected response: the map was applied two times.
-    Doubled,
-}
-
 /// Expected effect of the next map.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CompensationSummary {
     /// Largest absolute value of the map.
-    #[serde(rename = "largest_mm", with = "super::number")]
+    #[serde(rename = "largest_mm", with = "number")]
     pub max_correction_mm: f64,
     /// Maximum removal of the next pass at any place.
-    #[serde(with = "super::number")]
+    #[serde(with = "number")]
     pub depth_mm: f64,
     /// Expected PV after the next pass.
-    #[serde(with = "super::number")]
+    #[serde(with = "number")]
     pub predicted_pv_mm: f64,
     /// Expected RMS after the next pass.
-    #[serde(default, with = "super::number")]
+    #[serde(default, with = "number")]
     pub predicted_rms_mm: f64,
     /// Share of the part where the wheel will not cut, as far as it can be predicted.
-    #[serde(default, with = "super::number")]
+    #[serde(default, with = "number")]
     pub air_share: f64,
     /// Gains, as pairs: shortest wavelength of a band in millimetres, and share of the error in this band that the
     /// correction removes.
-    #[serde(default, with = "super::number::pairs")]
+    #[serde(default, with = "number::pairs")]
     pub gains: Vec<[f64; 2]>,
     /// Response of the part: change of the part as a share of the commanded correction.
-    #[serde(rename = "response", default, with = "super::number")]
+    #[serde(rename = "response", default, with = "number")]
     pub responded_share: f64,
     /// Other warnings for a person.
     pub warnings: Vec<String>,
@@ -817,6 +768,46 @@ impl Event {
             Self::ControlLost { .. } => "control_lost",
             Self::ControlBack => "control_back",
             Self::Deadline => "deadline",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::table::sample_events;
+
+    #[test]
+    fn event_serde_round_trip() {
+        let recorded = |event: &Event| serde_json::to_string(event).unwrap();
+        for event in sample_events(3) {
+            let text = recorded(&event);
+            let back: Event = serde_json::from_str(&text).unwrap_or_else(|error| panic!("{text}: {error}"));
+            assert_eq!(recorded(&back), text);
+        }
+        for (value, stands) in [(f64::NAN, "\"NaN\""), (f64::INFINITY, "\"inf\""), (-0.1, "-0.1"), (5e-324, "5e-324")] {
+            let text = recorded(&Event::Qualified { cycle: 1, radius_error_mm: value });
+            assert!(text.contains(&format!(":{stands}")), "{text}");
+            let Ok(Event::Qualified { radius_error_mm: back, .. }) = serde_json::from_str(&text) else { panic!() };
+            assert!(back == value || back.is_nan() && value.is_nan());
+        }
+        let old = r#"{"event":"qualified","cycle":1,"radius_error_mm":null}"#;
+        let Ok(Event::Qualified { radius_error_mm, .. }) = serde_json::from_str(old) else { panic!() };
+        assert!(radius_error_mm.is_nan());
+        assert!(serde_json::from_str::<Event>(&old.replace("null", "\"much\"")).is_err());
+    }
+
+    #[test]
+    fn figures_none_and_nan_round_trip() {
+        let Some(Event::Registered { figures, .. }) =
+            sample_events(1).into_iter().find(|event| matches!(event, Event::Registered { .. }))
+        else {
+            panic!("there is one")
+        };
+        for removed_mm in [None, Some(f64::NAN), Some(0.25)] {
+            let text = serde_json::to_string(&Figures { removed_mm, ..figures.clone() }).unwrap();
+            let back: Figures = serde_json::from_str(&text).unwrap();
+            assert_eq!(format!("{:?}", back.removed_mm), format!("{removed_mm:?}"));
         }
     }
 }

@@ -1,8 +1,9 @@
 //! Judgement of the figures of a cycle: the verdict and its reason, in words.
 
+use regrind_figures::{Interval, PartResponse};
+
 use super::command::Verdict;
-use super::event::{Figures, PartResponse};
-use super::interval::RecordedInterval;
+use super::event::Figures;
 use super::plan::{CellPlan, PvPoints, Tolerance};
 
 /// Factor by which a figure must exceed the one of the cycle before to make the cycle worse.
@@ -45,14 +46,14 @@ impl Figures {
     ///
     /// The flag is true if the first interval belongs to the PV 99.8 %, and false if it belongs to the PV of all
     /// points.
-    fn judged_intervals(&self, pv_points: PvPoints) -> ([RecordedInterval; 2], bool) {
+    fn judged_intervals(&self, pv_points: PvPoints) -> ([Interval; 2], bool) {
         match &self.form {
             Some(form) if pv_points == PvPoints::MostPoints => ([form.pv_998, form.rms], true),
             Some(form) => ([form.pv, form.rms], false),
             None => {
                 let robust = self.pv_998_mm.filter(|_| pv_points == PvPoints::MostPoints);
-                let pv = RecordedInterval::from_expanded(robust.unwrap_or(self.pv_mm), self.pv_expanded_mm);
-                ([pv, RecordedInterval::from_expanded(self.rms_mm, self.rms_expanded_mm)], robust.is_some())
+                let pv = Interval::from_expanded(robust.unwrap_or(self.pv_mm), self.pv_expanded_mm);
+                ([pv, Interval::from_expanded(self.rms_mm, self.rms_expanded_mm)], robust.is_some())
             }
         }
     }
@@ -110,8 +111,7 @@ impl ComparedFigure {
     /// Returns a text for people with the probability that the figure is within its limit, for example "P(in tolerance)
     /// = 84.1 %". Returns `None` if the figure has no limit.
     pub fn probability_in_words(&self) -> Option<String> {
-        let [least, most] =
-            [RecordedInterval::PROBABILITIES[0], RecordedInterval::PROBABILITIES[RecordedInterval::COUNT - 1]];
+        let [least, most] = [Interval::PROBABILITIES[0], Interval::PROBABILITIES[Interval::COUNT - 1]];
         self.probability_in_tolerance.map(|within| match within {
             _ if within <= least => format!("P(in tolerance) < {}", format_percent(least)),
             _ if within >= most => format!("P(in tolerance) > {}", format_percent(most)),
@@ -132,7 +132,7 @@ impl Tolerance {
     /// 99.8 % or the PV of all points.
     pub fn compare(&self, figures: &Figures) -> [ComparedFigure; 2] {
         let ([pv, rms], is_robust) = figures.judged_intervals(self.pv_points);
-        let compared = |name, of: RecordedInterval, limit_mm: f64| {
+        let compared = |name, of: Interval, limit_mm: f64| {
             let between_mm = [of.low_mm, of.high_mm];
             let held_mm = match self.with_uncertainty {
                 true => [1.0 - self.probability, self.probability].map(|share| of.quantile_mm(share)),

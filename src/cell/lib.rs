@@ -27,11 +27,9 @@ mod cycle_row;
 mod ending;
 mod event;
 mod interruptions;
-mod interval;
 mod judge;
 mod machine_job;
 mod measurement;
-mod number;
 mod phase_queries;
 mod plan;
 mod run_sequence;
@@ -45,11 +43,10 @@ pub use cell::Cell;
 pub use command::{Command, Ending, Judgement, Verdict};
 pub use cycle_row::CycleRow;
 pub use event::{
-    Actor, CompensationRefusal, CompensationSummary, Condition, ConnectionRefusal, Event, Figures, Forecast,
-    FurtherTouches, GateFailure, GateResult, JobResult, MachineRequest, Occupation, OutlierFigures, PartResponse,
-    Reconciliation, RecordFailure, RecordedFormFigures, RecordedParameter,
+    Actor, CompensationRefusal, CompensationSummary, Condition, ConnectionRefusal, Event, Figures, FurtherTouches,
+    GateFailure, GateResult, JobResult, MachineRequest, Occupation, OutlierFigures, Reconciliation, RecordFailure,
+    RecordedParameter,
 };
-pub use interval::RecordedInterval;
 pub use judge::{ComparedFigure, Conformity};
 pub use plan::{CellPlan, Deadlines, FirstStep, GateLimits, HoldOrStop, PvPoints, Tolerance};
 pub use state::{Device, JobStep, Phase, State, StateName};

@@ -5,7 +5,9 @@ use std::sync::Arc;
 use super::alarm::AlarmId;
 use super::cell::Cell;
 use super::command::{Command, Judgement, Verdict};
-use super::event::{CompensationRefusal, Figures, GateFailure, GateResult, PartResponse};
+use regrind_figures::PartResponse;
+
+use super::event::{CompensationRefusal, Figures, GateFailure, GateResult};
 use super::judge::{self, ReasonedVerdict, format_um};
 use super::plan::HoldOrStop;
 use super::state::{Device, JobStep, Phase, State};

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use regrind_figures::number;
 use serde::{Deserialize, Serialize};
 
 /// Parameters by which the cell decides. The code that builds a plan checks its values. With a NaN as a limit, the cell
@@ -55,10 +56,10 @@ pub enum FirstStep {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Tolerance {
     /// Limit of the peak to valley; infinite if it is not limited.
-    #[serde(deserialize_with = "super::number::limit")]
+    #[serde(deserialize_with = "number::limit")]
     pub pv_mm: f64,
     /// Limit of the root mean square; infinite if it is not limited.
-    #[serde(deserialize_with = "super::number::limit")]
+    #[serde(deserialize_with = "number::limit")]
     pub rms_mm: f64,
     /// True if a figure must be within its limit with `probability`. If false, the median is compared with the limit.
     pub with_uncertainty: bool,

@@ -5,12 +5,13 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::hash::Hash;
 use std::time::Duration;
 
+use regrind_figures::PartResponse;
+
 use super::cell::Cell;
 use super::command::{Command, format_label};
 use super::event::{
     Actor, CompensationRefusal, CompensationSummary, Condition, ConnectionRefusal, Event, Figures, FurtherTouches,
-    GateFailure, GateResult, JobResult, MachineRequest, Occupation, OutlierFigures, PartResponse, Reconciliation,
-    RecordFailure,
+    GateFailure, GateResult, JobResult, MachineRequest, Occupation, OutlierFigures, Reconciliation, RecordFailure,
 };
 use super::plan::{CellPlan, Deadlines, FirstStep, GateLimits, HoldOrStop, PvPoints, Tolerance};
 use super::state::{Device, JobStep, Phase, State};

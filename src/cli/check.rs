@@ -8,6 +8,7 @@ use annotate_snippets::renderer::DecorStyle;
 use annotate_snippets::{AnnotationKind, Level, Origin, Renderer, Snippet};
 use clap::Args;
 use console::Term;
+use data_encoding::HEXLOWER;
 use regrind::config::{CellConfig, DialectFile, read_dialect};
 use regrind::document::{Problem, Problems};
 use regrind::recipe::{MeasuringPattern, NominalSource, Recipe};
@@ -106,17 +107,17 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 /// result is the SHA-256 hash of the file with notes for people, or all problems of the file.
 fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     if has_table(path, &["[dialect]"]) {
-        let good = |file: DialectFile| Good { sha256: hex(&file.source_sha256), notes: file.renamed_keys };
+        let good = |file: DialectFile| Good { sha256: HEXLOWER.encode(&file.source_sha256), notes: file.renamed_keys };
         return ("dialect", read_dialect(path).map(good));
     }
     if has_table(path, &["[cell]", "[cmm", "[[cmm", "[grinder]", "[grinder.", "[[grinder"]) {
-        let good = |cell: CellConfig| Good { sha256: hex(cell.source_sha256()), notes: cell.notes() };
+        let good = |cell: CellConfig| Good { sha256: HEXLOWER.encode(cell.source_sha256()), notes: cell.notes() };
         return ("cell file", CellConfig::read(path).map(good));
     }
     let checked = Recipe::read(path).and_then(|recipe| {
         check_files(&recipe)?;
         check_simulation(&recipe)?;
-        Ok(Good { sha256: hex(recipe.source_sha256()), notes: recipe.notes().to_vec() })
+        Ok(Good { sha256: HEXLOWER.encode(recipe.source_sha256()), notes: recipe.notes().to_vec() })
     });
     ("recipe", checked)
 }
@@ -228,10 +229,6 @@ impl ProblemDocument {
         let Problem { key, found, allowed, remedy, .. } = problem.clone();
         Self { line, column, key, found, allowed, remedy }
     }
-}
-
-fn hex(bytes: &[u8; 32]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 #[cfg(test)]

@@ -110,11 +110,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let map = read_program_map(&arguments.map).map_err(Failure::Program)?;
     // An error is subtracted. A correction is already the displacement of the surface.
     let sign = if map.kind == MapKind::Error { -arguments.gain } else { arguments.gain };
-    let values_mm = map.values_mm.iter().map(|v| sign * v).collect();
+    let values_mm = map.nodes.values_mm.iter().map(|v| sign * v).collect();
     let tip_mm = arguments.tip_of_radius.unwrap_or(0.0);
-    let level_off_mm = LEVEL_OFF_NODES * map.grid.spacing_mm[0].max(map.grid.spacing_mm[1]);
+    let level_off_mm = LEVEL_OFF_NODES * map.nodes.grid.spacing_mm[0].max(map.nodes.grid.spacing_mm[1]);
     let shift = correction_spline(
-        &Correction { grid: map.grid, values_mm, cycle: 1, level_mm: 0.0, parameters: None },
+        &Correction { grid: map.nodes.grid, values_mm, cycle: 1, level_mm: 0.0, parameters: None },
         level_off_mm,
     );
     let ground = arguments.nominal.as_ref().map(|file| ground(file, &arguments.table.table())).transpose()?;

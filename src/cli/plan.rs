@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use data_encoding::HEXLOWER;
 use regrind::cell::{CellPlan, FirstStep};
 use regrind::compensation::path::{ArcSummary, PathSummary, Peak, Scallops, ToolPath};
 use regrind::config::{BUILT_IN_CELL, CellConfig};
@@ -295,7 +296,7 @@ impl Document {
         Self {
             simulation: cell.simulated,
             part: recipe.part.name.clone(),
-            part_identity: task.part_identity.iter().map(|b| format!("{b:02x}")).collect(),
+            part_identity: HEXLOWER.encode(&task.part_identity),
             nominal_points: task.nominal.len(),
             targets: task.targets.len(),
             touches_are_chosen: task.adaptive.is_some(),

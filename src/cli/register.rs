@@ -4,13 +4,14 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use regrind::figures::Interval;
 use regrind::formats::run_files::CycleFile;
 use regrind::formats::{
     Alternative, Columns, NominalInput, NotedPoints, RegistrationDocument, ResultFolder, Table, Unit, is_map,
     read_measured_with_notes, save_form, save_registration,
 };
 use regrind::geometry::Pose;
-use regrind::model::{AngleInterval, Form, Interval, IsoFigures, ModelInputs, SlopeFigures};
+use regrind::model::{AngleInterval, Form, IsoFigures, ModelInputs, SlopeFigures};
 use regrind::registration::{Coordinate, Loss, Method, ProbeSide, RegistrationOptions, Start, register};
 use regrind::surface::{DistanceModel, Nominal, NominalKind, PlaneProjection};
 

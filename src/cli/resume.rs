@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use clap::Args;
+use data_encoding::HEXLOWER;
 use regrind::cell::{Actor, CellPlan, TABLE_VERSION};
 use regrind::config::CellConfig;
 use regrind::drive::{InterruptedRun, Request, Task};
@@ -254,9 +255,8 @@ impl RunStart {
             let from = learned.run.clone();
             task.start_from_learned(learned).map_err(|source| Failure::TooMuchLearned { run: from, source })?;
         }
-        let identity: String = task.part_identity.iter().map(|b| format!("{b:02x}")).collect();
         let differs = |what: &'static str| Err(Failure::OtherTask { run: run.to_owned(), what });
-        if identity != self.nominal_sha256 {
+        if HEXLOWER.encode(&task.part_identity) != self.nominal_sha256 {
             return differs("the nominal surface");
         }
         if !task.setting.fits(&self.setting) {

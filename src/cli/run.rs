@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use clap::Args;
+use data_encoding::HEXLOWER;
 use regrind::cell::{Actor, CellPlan, Ending, FirstStep, TABLE_VERSION};
 use regrind::config::{BUILT_IN_CELL, CellConfig};
 use regrind::drive::Task;
@@ -305,7 +306,6 @@ fn header(
     place: RunPlace,
 ) -> Header {
     let RunContext { recipe, cell, folder, actor, .. } = live;
-    let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
     let learned = earlier.and_then(|earlier| earlier.learned.as_ref()).map(|(learned, _)| learned);
     let left_alone = earlier.iter().flat_map(|earlier| &earlier.skipped).map(ToString::to_string);
     let left_alone: Vec<String> =
@@ -321,11 +321,11 @@ fn header(
         first_command_id: 1,
         content: RunContent::Part(Box::new(PartStart {
             recipe: Some(recipe.path().to_string_lossy().into_owned()),
-            recipe_sha256: Some(hex(recipe.source_sha256())),
+            recipe_sha256: Some(HEXLOWER.encode(recipe.source_sha256())),
             cell: Some(cell.path().to_string_lossy().into_owned()),
-            cell_sha256: Some(hex(cell.source_sha256())),
+            cell_sha256: Some(HEXLOWER.encode(cell.source_sha256())),
             working_folder: Some(std::env::current_dir().unwrap_or_default().to_string_lossy().into_owned()),
-            nominal_sha256: Some(hex(&task.part_identity)),
+            nominal_sha256: Some(HEXLOWER.encode(&task.part_identity)),
             setting: Some(task.setting.id.clone()),
             part_name: Some(recipe.part.name.clone()),
             part_in_files: Some(live.part.to_owned()),

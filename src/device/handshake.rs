@@ -129,11 +129,6 @@ pub fn digest(identities: &[[u8; 32]]) -> u32 {
     crc.finalize()
 }
 
-/// Returns bytes as hexadecimal digits.
-pub fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
-}
-
 /// Job that the machine has checked, with the data of the START that would begin it. Write it to the journal before
 /// [`start`](super::Machine::start).
 ///

@@ -37,6 +37,7 @@ mod machine;
 mod machine_table;
 mod manual;
 mod modbus;
+mod network_address;
 mod no_machine;
 mod payload;
 mod plan_mismatch;
@@ -46,7 +47,6 @@ pub use driver_factory::{ConnectionCheck, DriverContext, DriverError, DriverFact
 pub use driver_table::{AnyCmm, AnyGrinder, Wire};
 pub use error::DeviceError;
 use error::DeviceResult;
-pub use handshake::hex;
 pub use handshake::{
     Answer, Armed, BatchId, Fault, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation,
     Outcome, Reconciled, SignalValue, Started, Status, digest,

@@ -4,6 +4,7 @@ use thiserror::Error;
 
 use crate::{Coordinates, Measurement, Plan, TargetKind, TouchStatus};
 use regrind_core::geometry::{Point, Vector, fit_rigid};
+use regrind_figures::statistics::root_mean;
 
 /// Reason why a measurement does not belong to the plan.
 #[derive(Clone, Debug, Error, PartialEq)]
@@ -88,7 +89,7 @@ impl Plan {
 fn size(points: &[Point]) -> f64 {
     let count = points.len().max(1) as f64;
     let middle = points.iter().map(|p| p.coords).sum::<Vector>() / count;
-    (points.iter().map(|p| (p.coords - middle).norm_squared()).sum::<f64>() / count).sqrt()
+    root_mean(points.iter().map(|p| (p.coords - middle).norm_squared()))
 }
 
 /// Returns true if points lie almost on a line. The line leads from the centroid of the points through the farthest

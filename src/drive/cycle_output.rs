@@ -38,7 +38,7 @@ pub(super) fn save_figures(
     // Slopes of the form and of the map are compared, so both use the same length. The places of the form determine it.
     let slope_length_mm = form.and_then(|form| form.slope).map(|slope| slope.integration_mm);
     let integration_mm = slope_length_mm.unwrap_or(SLOPE_LENGTH_SHARE * task.map_options.cutoff_mm);
-    let slopes = map.map(|map| slope(&map.grid, &map.values_mm, &map.valid, integration_mm));
+    let slopes = map.map(|map| slope(&map.nodes, integration_mm));
     let slopes = slopes.as_ref().map(Result::as_ref);
     write_figures(
         &files.add_file(CycleFile::Figures),
@@ -193,7 +193,7 @@ pub(super) fn save_error_map(
 fn save_pictures(task: &Task, files: &mut OutputFiles, map: &ErrorMap) -> Result<(), ReportError> {
     let title =
         if task.simulation { "Error of the part, filtered (SIMULATION)" } else { "Error of the part, filtered" };
-    let mut picture = HeatMap::of_lengths(title, "deviation", &map.samples_mm())?.of_nodes();
+    let mut picture = HeatMap::of_lengths(title, "deviation", &map.nodes.samples_mm().collect::<Vec<_>>())?.of_nodes();
     if let Some(outline) = task.nominal.outline() {
         picture = picture.within(outline);
     }

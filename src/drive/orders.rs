@@ -1,12 +1,13 @@
 //! Orders of people: events for the cell, confirmations for a machine, and remarks for the record.
 
+use data_encoding::HEXLOWER;
 use regrind_control::{ReceivedOrder, Reply, Request};
 use tokio::sync::oneshot;
 
 use super::Drive;
 use super::record_queue::RecordAction;
 use crate::cell::{Actor, Device, Event, Phase};
-use crate::device::{Identified, OperatorConfirmation, hex};
+use crate::device::{Identified, OperatorConfirmation};
 use crate::record::{Confirmation, Content, Remark};
 
 impl Drive {
@@ -142,7 +143,7 @@ impl Drive {
         let cycle = self.cycles.get(self.cell.cycle()).filter(|_| grinds);
         let Some(cycle) = cycle else { return Err("no pass is in progress".into()) };
         let identity = self.task.payloads(&cycle.correction).0.identity();
-        let whole = hex(&identity);
+        let whole = HEXLOWER.encode(&identity);
         if digits.len() < 8 {
             return Err(
                 "give at least the first 8 digits of the map identity; the file correction.csv has this identity"

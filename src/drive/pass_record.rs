@@ -1,6 +1,8 @@
 //! Plausibility check of a grinder's pass record against the commanded pass. An implausible figure holds the cell
 //! before anything is done with it.
 
+use data_encoding::HEXLOWER;
+
 use crate::device::{Job, Outcome, Pass, PassRecord};
 use crate::geometry::Aperture;
 use crate::record::{PassFigures, PassNote};
@@ -46,7 +48,7 @@ pub(super) fn implausible_figure(told: &CommandedPass, record: &PassRecord) -> O
         ));
     }
     if record.map_identity != *map_identity {
-        let short = |identity: &[u8; 32]| identity[..4].iter().map(|b| format!("{b:02x}")).collect::<String>();
+        let short = |identity: &[u8; 32]| HEXLOWER.encode(&identity[..4]);
         let (is, told) = (short(&record.map_identity), short(map_identity));
         return Some(format!("the grinder used map {is}, but map {told} was sent"));
     }

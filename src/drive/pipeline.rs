@@ -10,14 +10,15 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use crate::cell::{
-    CompensationRefusal, CompensationSummary, Event, Figures, Forecast, GateFailure, GateResult, OutlierFigures,
-    PartResponse, RecordedFormFigures, RecordedInterval, RecordedParameter,
+    CompensationRefusal, CompensationSummary, Event, Figures, GateFailure, GateResult, OutlierFigures,
+    RecordedParameter,
 };
 use crate::compensation::{
-    self, Correction, ErrorMap, LearningState, NextPassError, PassObservation, ResponseKind, error_map,
-    estimate_response,
+    self, Correction, ErrorMap, LearningState, NextPassError, PassObservation, error_map, estimate_response,
 };
 use crate::device::{Coordinates, Identified, MeasuredPoint, Measurement, Plan, PlanMismatch, TargetKind, TouchStatus};
+use crate::figures::statistics::rms;
+use crate::figures::{Forecast, FormFigures, Interval, PartResponse};
 use crate::form::pv_998;
 use crate::formats::run_files::CycleFile;
 use crate::formats::{FormatError, Learned, ResultFolder, write_json_atomic, write_points};
@@ -431,7 +432,7 @@ pub(super) fn cell_figures(
     form: Option<&Form>,
     error: Option<&ErrorMap>,
     answer: Option<compensation::Response>,
-    forecast: Option<compensation::Forecast>,
+    forecast: Option<Forecast>,
 ) -> Figures {
     let verdict = &found.quality;
     let moved = task.fixture_cmm_from_model.inverse() * found.cmm_from_model;
@@ -444,16 +445,16 @@ pub(super) fn cell_figures(
     let pv_expanded_mm = 2.0 * 2f64.sqrt() * scatter_mm;
     // The peak to valley is not negative.
     let pv_about = |mm| {
-        let of = RecordedInterval::from_expanded(mm, pv_expanded_mm);
-        RecordedInterval { low_mm: of.low_mm.max(0.0), ..of }
+        let of = Interval::from_expanded(mm, pv_expanded_mm);
+        Interval { low_mm: of.low_mm.max(0.0), ..of }
     };
-    let by_points = RecordedFormFigures {
+    let by_points = FormFigures {
         pv: pv_about(verdict.pv_mm),
         pv_998: pv_about(pv_robust_mm.unwrap_or(verdict.pv_mm)),
         rms: rms_without_noise(scatter_mm, verdict),
         noise_sigma_mm: scatter_mm,
     };
-    let told = form.map_or(by_points, |form| cell_form_figures(&form.figures, scatter_mm));
+    let told = form.map_or(by_points, |form| form.figures);
     // The forecast must be of the same figure: the filtered map still contains the noise of the probe, and the part
     // does not.
     let bare = |mm: f64| subtract_in_quadrature(scatter_mm, mm);
@@ -479,12 +480,8 @@ pub(super) fn cell_figures(
         rotation_rad: moved.angle_rad(),
         weak_directions: verdict.weak_directions.iter().map(|w| w.description.clone()).collect(),
         warnings: verdict.warnings.clone(),
-        response: answer.map(|answer| cell_response(answer.kind)),
-        forecast: forecast.map(|f| Forecast {
-            rms_mm: bare(f.rms_mm),
-            sigma_mm: f.sigma_mm,
-            floor_mm: f.floor_mm.map(bare),
-        }),
+        response: answer.map(|answer| answer.kind),
+        forecast: forecast.map(|f| Forecast { rms_mm: bare(f.rms_mm), floor_mm: f.floor_mm.map(bare), ..f }),
         removed_mm: Some(task.correction_limits.allowance_mm - cycle.correction.level_mm),
         unstated: form.and_then(|form| unstated_contributions(task, form)),
         further_touches: None,
@@ -509,44 +506,19 @@ fn subtract_in_quadrature(scatter_mm: f64, rms_mm: f64) -> f64 {
     (rms_mm * rms_mm - scatter_mm * scatter_mm).max(0.0).sqrt()
 }
 
-// The model and the record must use the same probabilities.
-const _: () = {
-    let mut k = 0;
-    while k < RecordedInterval::COUNT {
-        assert!(RecordedInterval::PROBABILITIES[k] == model::Interval::PROBABILITIES[k]);
-        k += 1;
-    }
-};
-
-/// Converts the form figures of the error model (intervals of PV, PV 99.8 % and RMS, in mm) into the type that the cell
-/// judges and records. `scatter_mm` is the standard deviation of the probe's noise. It is copied into the result and
-/// changes no figure.
-fn cell_form_figures(of: &model::FormFigures, scatter_mm: f64) -> RecordedFormFigures {
-    let interval = |of: model::Interval| {
-        let model::Interval { median_mm, low_mm, high_mm, quantiles_mm, .. } = of;
-        RecordedInterval { median_mm, low_mm, high_mm, quantiles_mm: Some(quantiles_mm) }
-    };
-    RecordedFormFigures {
-        pv: interval(of.pv),
-        pv_998: interval(of.pv_998),
-        rms: interval(of.rms),
-        noise_sigma_mm: scatter_mm,
-    }
-}
-
 /// Returns the interval (k = 2) in mm of F, the root mean square of the form without the noise of the probe.
 /// `scatter_mm` is s, the standard deviation of this noise. `verdict` contains RMS, the root mean square of the
 /// deviations, and n, the number of points that the registration used.
 ///
 /// With p = 6 degrees of freedom of the registration, F^2 = RMS^2 - s^2 (1 - p/n). Its uncertainty u is given by
 /// u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n.
-fn rms_without_noise(scatter_mm: f64, verdict: &RegistrationQuality) -> RecordedInterval {
+fn rms_without_noise(scatter_mm: f64, verdict: &RegistrationQuality) -> Interval {
     const MOTIONS: f64 = 6.0;
     let n = (verdict.inliers as f64).max(MOTIONS + 1.0);
     let scatter2 = scatter_mm * scatter_mm;
     let form2 = (verdict.rms_mm.powi(2) - scatter2 * (1.0 - MOTIONS / n)).max(0.0);
     let expanded2 = 2.0 * ((4.0 * form2 * scatter2 + 2.0 * scatter2 * scatter2) / n).sqrt();
-    RecordedInterval {
+    Interval {
         median_mm: form2.sqrt(),
         low_mm: (form2 - expanded2).max(0.0).sqrt(),
         high_mm: (form2 + expanded2).sqrt(),
@@ -564,17 +536,6 @@ pub(super) fn part_response(
     let places: Vec<(Point, Vector)> = used_deviations(found).map(|d| (d.point, d.normal)).collect();
     let scatter_mm = earlier.point_sigma_mm.hypot(error.point_sigma_mm);
     Some(estimate_response([earlier, error], [&before.correction, &cycle.correction], &places, scatter_mm))
-}
-
-fn cell_response(sense: ResponseKind) -> PartResponse {
-    match sense {
-        ResponseKind::AsCommanded => PartResponse::Expected,
-        ResponseKind::Flipped => PartResponse::SignFlipped,
-        ResponseKind::MirroredX | ResponseKind::MirroredY | ResponseKind::Turned => PartResponse::Mirrored,
-        ResponseKind::NoEffect => PartResponse::NoEffect,
-        ResponseKind::Doubled => PartResponse::Doubled,
-        ResponseKind::Unclear => PartResponse::Unclear,
-    }
 }
 
 /// Computes the correction for the pass after cycle `number`, and writes it to `files`. Returns the event for the cell
@@ -679,10 +640,6 @@ pub(super) fn recorded_parameters(task: &Task, cycle: &CycleState) -> Vec<Record
         }
     };
     wanted.map(told).collect()
-}
-
-fn rms(values: &[f64]) -> f64 {
-    (values.iter().map(|v| v * v).sum::<f64>() / values.len().max(1) as f64).sqrt()
 }
 
 /// Returns one text for each machine parameter for which a person must decide before the next pass. These are the

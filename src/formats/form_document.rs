@@ -8,8 +8,9 @@ use super::document::StandardUncertainty;
 use super::error::FormatError;
 use super::registration::{write_json_atomic, write_rows};
 use super::run_files::CycleFile;
-use regrind_core::model::{BudgetEntry, Form, FormPoint, Interval, IsoFigures, SlopeFigures};
+use regrind_core::model::{BudgetEntry, Form, FormPoint, IsoFigures, SlopeFigures};
 use regrind_core::registration::Registration;
+use regrind_figures::Interval;
 
 /// Columns of `form.csv`.
 const FORM_HEADER: &str = "x_mm,y_mm,form_mm,sigma_mm";
@@ -82,9 +83,9 @@ pub fn save_form(
         scatter_drift: form.hyperparameters.noise_autocorrelation,
         form_is_seen: form.is_detected,
         degrees_of_freedom: form.degrees_of_freedom,
-        rms: form.figures.rms,
-        pv: form.figures.pv,
-        pv_99_8: form.figures.pv_998,
+        rms: without_quantiles(form.figures.rms),
+        pv: without_quantiles(form.figures.pv),
+        pv_99_8: without_quantiles(form.figures.pv_998),
         budget: &form.budget,
         slope: form.slope,
         iso_10110_5: form.iso,
@@ -104,4 +105,8 @@ pub fn save_form(
     let row = |of: &FormPoint| [of.place_mm[0], of.place_mm[1], of.form.mean_mm, of.form.sigma_mm];
     let rows: Vec<[f64; 4]> = form.points.iter().map(row).collect();
     write_rows(&folder.join(CycleFile::Form.name()), FORM_HEADER, &rows, |row| (*row, None))
+}
+
+fn without_quantiles(of: Interval) -> Interval {
+    Interval { quantiles_mm: None, ..of }
 }

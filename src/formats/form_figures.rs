@@ -4,7 +4,8 @@
 use serde::Serialize;
 
 use regrind_core::form::{DeviationFigures, Iso10110, RemovedParts, Slope, iso_10110_notation};
-use regrind_core::model::{AngleInterval, Form, Interval, IsoFigures};
+use regrind_core::model::{AngleInterval, Form, IsoFigures};
+use regrind_figures::Interval;
 
 /// Figure of the form.
 #[derive(Serialize)]

@@ -4,7 +4,8 @@ use std::path::Path;
 
 use super::error::FormatError;
 use super::number::{LIMIT_MM, is_believable};
-use regrind_core::geometry::{Grid, Point};
+use regrind_core::geometry::{Grid, GridMap, Point};
+use regrind_figures::statistics::rms;
 
 /// Maximum number of samples of a map that is read: 450 MB of them.
 pub(super) const MAX_SAMPLES: u64 = 50_000_000;
@@ -15,12 +16,8 @@ pub(super) const MAX_SAMPLES: u64 = 50_000_000;
 /// millimetres.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeightMap {
-    /// Grid of the samples.
-    pub grid: Grid,
-    /// Heights; finite everywhere, and 0 for samples that are not valid.
-    pub heights_mm: Vec<f64>,
-    /// True for each sample that was measured.
-    pub valid: Vec<bool>,
+    /// Heights of the samples; finite everywhere. A sample is valid if it was measured; the height of the others is 0.
+    pub heights: GridMap,
     /// Notes on ambiguous content of the file and how it was read, in words.
     pub notes: Vec<String>,
 }
@@ -73,37 +70,33 @@ impl HeightMap {
         if !valid.contains(&true) {
             return Err(FormatError::NoData { path: path.to_owned(), expected: "sample that was measured" });
         }
-        Ok(Self { grid, heights_mm, valid, notes: Vec::new() })
+        Ok(Self { heights: GridMap { grid, values_mm: heights_mm, valid }, notes: Vec::new() })
     }
 
     /// Returns the measured samples as points (x, y, height), in the order of the map.
     pub fn points(&self) -> Vec<Point> {
-        self.measured()
-            .map(|(k, height)| (self.grid.place_mm(k), height))
-            .map(|([x, y], z)| Point::new(x, y, z))
-            .collect()
+        self.heights.samples_mm().map(Point::from).collect()
     }
 
     /// Returns the number of measured samples.
     pub fn measured_count(&self) -> usize {
-        self.valid.iter().filter(|v| **v).count()
+        self.heights.valid_count()
     }
 
     /// Returns the maximum minus the minimum of the measured heights, in millimetres.
     pub fn pv_mm(&self) -> f64 {
-        let (low, high) = self.measured().fold((f64::MAX, f64::MIN), |(l, h), (_, z)| (l.min(z), h.max(z)));
+        let (low, high) = self.measured_mm().fold((f64::MAX, f64::MIN), |(l, h), z| (l.min(z), h.max(z)));
         high - low
     }
 
     /// Returns the root mean square of the measured heights minus their mean (the standard deviation), in millimetres.
     pub fn rms_mm(&self) -> f64 {
-        let count = self.measured_count() as f64;
-        let mean = self.measured().map(|(_, z)| z).sum::<f64>() / count;
-        (self.measured().map(|(_, z)| (z - mean).powi(2)).sum::<f64>() / count).sqrt()
+        let mean = self.measured_mm().sum::<f64>() / self.measured_count() as f64;
+        rms(self.measured_mm().map(|z| z - mean))
     }
 
-    fn measured(&self) -> impl Iterator<Item = (usize, f64)> {
-        self.heights_mm.iter().copied().enumerate().filter(|(k, _)| self.valid[*k])
+    fn measured_mm(&self) -> impl Iterator<Item = f64> {
+        self.heights.valid_values_mm().map(|(_, height)| height)
     }
 }
 
@@ -206,7 +199,7 @@ mod tests {
         let points = map.points();
         assert_eq!((points.len(), map.measured_count()), (5, 5));
         assert_eq!((points[1], points[4]), (Point::new(-0.5, 4.0, 1.0), Point::new(0.0, 6.0, 5.0)));
-        assert_eq!((map.pv_mm(), map.heights_mm[4]), (5.0, 0.0));
+        assert_eq!((map.pv_mm(), map.heights.values_mm[4]), (5.0, 0.0));
         // 0 1 2 3 5: mean 2.2, squared deviations from it 4.84 1.44 0.04 0.64 7.84.
         assert!((map.rms_mm() - (14.8f64 / 5.0).sqrt()).abs() < 1e-15);
     }

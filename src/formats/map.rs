@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
+use data_encoding::HEXLOWER;
+
 use super::error::FormatError;
-use super::gcode::hex;
 use super::registration::write_rows;
 use regrind_core::compensation::{Correction, ErrorMap};
 
@@ -38,19 +39,20 @@ pub fn write_error_map(
     origin: &ErrorMapOrigin,
     simulation: bool,
 ) -> Result<(), FormatError> {
-    let rows: Vec<([f64; 4], bool)> = (0..map.grid.len())
-        .map(|k| (map.grid.place_mm(k), k))
-        .map(|([x, y], k)| ([x, y, map.values_mm[k], map.sigma_mm[k]], map.valid[k]))
+    let nodes = &map.nodes;
+    let rows: Vec<([f64; 4], bool)> = (0..nodes.grid.len())
+        .map(|k| (nodes.grid.place_mm(k), k))
+        .map(|([x, y], k)| ([x, y, nodes.values_mm[k], map.sigma_mm[k]], nodes.valid[k]))
         .collect();
     let marked = if simulation { "# SIMULATION\n" } else { "" };
     let ground = match &origin.ground_with {
-        Some(identity) => format!("with: sha256 {}", hex(identity)),
+        Some(identity) => format!("with: sha256 {}", HEXLOWER.encode(identity)),
         None => "without a correction".into(),
     };
     let header = format!(
         "{marked}# part: sha256 {}\n# cycle: {}\n# the pass before was ground {ground}\n# frame: model; positive stands proud, along the outward \
          normal\n{ERROR_MAP_COLUMNS}",
-        hex(&origin.part),
+        HEXLOWER.encode(&origin.part),
         origin.cycle
     );
     write_rows(path, &header, &rows, |(values, valid)| (*values, Some(*valid)))
@@ -167,9 +169,9 @@ pub fn write_correction(
          nominal surface: {} mm\n# part: sha256 {}\n# map: sha256 {}\n# replaces: sha256 {}\n{taken}x_mm,y_mm,correction_mm",
         correction.cycle,
         correction.level_mm,
-        hex(&identities.part),
-        hex(&identities.map),
-        hex(&identities.replaces)
+        HEXLOWER.encode(&identities.part),
+        HEXLOWER.encode(&identities.map),
+        HEXLOWER.encode(&identities.replaces)
     );
     write_rows(path, &header, &rows, |values| (*values, None))
 }

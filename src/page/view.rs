@@ -6,6 +6,7 @@ use axum::extract::{Path, Query, State};
 use axum::http::header::{ACCEPT_LANGUAGE, CONTENT_TYPE, COOKIE};
 use axum::http::{HeaderMap, HeaderName, StatusCode};
 use axum::response::{IntoResponse, Redirect, Response};
+use data_encoding::HEXLOWER;
 use maud::{DOCTYPE, Markup, html};
 use regrind_cell::{Alarm, Device, Role, StateName, Tolerance};
 use regrind_control::{JobProgress, NextStep, PreviewStatistics, Snapshot};
@@ -510,7 +511,7 @@ fn script_texts(language: Language) -> Value {
 /// (red, green, blue) for each.
 fn colours(of: ColourMap) -> String {
     let colour = |k: u32| of.at(f64::from(k) / 254.0);
-    (0..255).flat_map(colour).map(|byte| format!("{byte:02x}")).collect()
+    HEXLOWER.encode(&(0..255).flat_map(colour).collect::<Vec<u8>>())
 }
 
 /// Filter for a list of runs. An empty field matches all runs.

@@ -4,6 +4,7 @@
 use std::fs;
 use std::path::Path;
 
+use data_encoding::HEXLOWER;
 use regrind_journal::{
     Anchor, Begin, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Seal, Verified, restore,
     restore_file, verify_against,
@@ -11,7 +12,6 @@ use regrind_journal::{
 use serde_json::Value;
 
 use super::error::{PlantError, refused};
-use super::hex::digits;
 use super::link::DatabaseLink;
 use super::settings::ArtefactSettings;
 
@@ -51,7 +51,7 @@ impl PlantRun {
             cell: row.get(1),
             name: row.get(2),
             records: u64::try_from(row.get::<_, i32>(3)).unwrap_or(0),
-            head: digits(row.get(4)),
+            head: HEXLOWER.encode(row.get(4)),
             keys: row.get::<_, Vec<String>>(5).iter().filter_map(|key| key.parse().ok()).collect(),
         })
     }
@@ -123,7 +123,7 @@ impl PlantRun {
                 link.client().query(text, &[&self.id, &after, &i64::from(PAGE)]).await.map_err(refused("records"))?;
             for row in &rows {
                 let (seq, hash, text): (i32, &[u8], &str) = (row.get(0), row.get(1), row.get(2));
-                let hash = digits(hash);
+                let hash = HEXLOWER.encode(hash);
                 let seq = u64::try_from(seq).unwrap_or(0);
                 let broken = |what: &str| JournalError::Broken { path: folder.to_owned(), seq, what: what.into() };
                 if seq != records.len() as u64 + 1 {
@@ -196,7 +196,7 @@ pub async fn content(
         (Some(content), ..) => Ok(Some(content)),
         (None, Some(_), Some(kept)) => {
             // The path is built from the hash here too, so a text in a table cannot lead to another file.
-            let name = digits(sha256);
+            let name = HEXLOWER.encode(sha256);
             let path = kept.folder.join(&name[..2]).join(&name);
             // A network share that is gone can hang, so the read runs in a blocking thread and other work continues.
             let at = path.clone();

@@ -5,6 +5,7 @@ use std::fs;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
+use data_encoding::HEXLOWER;
 use regrind_formats::run_files::RunFile;
 use regrind_formats::{CellRun, Learned, SettingIdentity};
 use regrind_journal::sha256_hex;
@@ -13,7 +14,6 @@ use tokio_postgres::Row;
 use tokio_postgres::types::ToSql;
 
 use super::error::{PlantError, refused};
-use super::hex::digits;
 use super::link::DatabaseLink;
 use super::settings::ArtefactSettings;
 
@@ -130,12 +130,12 @@ fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool
     let content = match (row.get::<_, Option<Vec<u8>>>(5), artefacts) {
         (Some(content), _) => content,
         (None, Some(kept)) => {
-            let name = digits(sha256);
+            let name = HEXLOWER.encode(sha256);
             bounded(&kept.folder.join(&name[..2]).join(&name)).map_err(|error| error.to_string())?
         }
         (None, None) => return Err("its file is in a folder that [artefacts] of this plant file does not name".into()),
     };
-    if sha256_hex(&content) != digits(sha256) {
+    if sha256_hex(&content) != HEXLOWER.encode(sha256) {
         return Err("it differs from the record".into());
     }
     let place: PathBuf = [&from.cell, &from.run, RunFile::Learned.name()].iter().collect();
@@ -170,7 +170,7 @@ pub(crate) async fn teach(link: &DatabaseLink, folder: &Path, id: i32) -> Result
     let sha256: &[u8] = row.get(0);
     // A file that differs from its record was reported elsewhere, and is not used for learning.
     let Ok(content) = fs::read(folder.join(RunFile::Learned.name())) else { return Ok(None) };
-    if sha256_hex(&content) != digits(sha256) {
+    if sha256_hex(&content) != HEXLOWER.encode(sha256) {
         return Ok(None);
     }
     // A file of an earlier version does not name its kind of parts, so it is not used either.

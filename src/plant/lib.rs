@@ -6,7 +6,6 @@
 
 mod copy;
 mod error;
-mod hex;
 mod knowledge;
 mod link;
 mod page;

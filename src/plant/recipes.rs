@@ -6,11 +6,11 @@
 
 use std::collections::BTreeMap;
 
+use data_encoding::HEXLOWER;
 use regrind_journal::{AuditKey, PublicKey, sha256_hex};
 use tokio_postgres::types::ToSql;
 
 use super::error::{PlantError, refused};
-use super::hex::{digits, unhex};
 use super::link::DatabaseLink;
 use super::settings::Approver;
 
@@ -79,7 +79,7 @@ impl PlantRecipe {
         if let Some(reason) = row.get::<_, Option<String>>(1) {
             return Err(PlantError::Recipe(format!("{reason}; nothing was stored")));
         }
-        Ok(digits(row.get(0)))
+        Ok(HEXLOWER.encode(row.get(0)))
     }
 
     /// Reads the recipe with this `name` and `version` from the plant. If `version` is `None`, reads the newest version
@@ -114,7 +114,7 @@ impl PlantRecipe {
     pub async fn approve(&self, link: &DatabaseLink, person: &str, key: &AuditKey) -> Result<(), PlantError> {
         let sha256 = self.sha256();
         let signature = key.sign(words(&sha256, person).as_bytes());
-        let (bytes, key) = (unhex(&sha256).unwrap_or_default(), key.public().to_string());
+        let (bytes, key) = (HEXLOWER.decode(sha256.as_bytes()).unwrap_or_default(), key.public().to_string());
         let text = "INSERT INTO approval (recipe, person, key, signature) VALUES ($1, $2, $3, $4)";
         let put = link.client().execute(text, &[&bytes, &person, &key, &signature]).await;
         match put {
@@ -144,7 +144,7 @@ impl PlantRecipe {
         sha256: &str,
         approvers: &[Approver],
     ) -> Result<(Self, Vec<String>), PlantError> {
-        let bytes = unhex(sha256).unwrap_or_default();
+        let bytes = HEXLOWER.decode(sha256.as_bytes()).unwrap_or_default();
         let text = "SELECT name, version, text, names, contents, persons, keys, signatures FROM pull_recipe($1)";
         let row = link.client().query_opt(text, &[&bytes]).await.map_err(refused("a recipe"))?;
         let found = match &row {

@@ -14,6 +14,7 @@ use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use data_encoding::HEXLOWER;
 use regrind_formats::run_files::RunFile;
 use regrind_formats::{ResultFolder, write_atomic};
 use regrind_journal::{Reader, Record, RecordKind, Stamp, has_record, sha256_hex, stamp};
@@ -23,7 +24,6 @@ use tokio_postgres::types::ToSql;
 
 use super::copy::PlantRun;
 use super::error::{PlantError, refused};
-use super::hex::{digits, unhex};
 use super::knowledge::teach;
 use super::link::DatabaseLink;
 use super::settings::ArtefactSettings;
@@ -237,7 +237,7 @@ impl Replicator {
             Ok(content) => content,
             Err(error) => return Ok(Some(format!("cannot be read: {error}"))),
         };
-        if sha256_hex(&content) != digits(sha256) {
+        if sha256_hex(&content) != HEXLOWER.encode(sha256) {
             return Ok(Some("was changed".into()));
         }
         let failed = refused("the content of a file");
@@ -265,7 +265,7 @@ impl Replicator {
 /// digits, in a subfolder that is named by its first two digits. Does nothing if the file already has this content, and
 /// otherwise replaces it.
 fn put_aside(folder: &Path, sha256: &[u8], content: &[u8]) -> Result<(), PlantError> {
-    let name = digits(sha256);
+    let name = HEXLOWER.encode(sha256);
     let path = folder.join(&name[..2]).join(&name);
     if fs::read(&path).is_ok_and(|found| found == content) {
         return Ok(());
@@ -299,7 +299,7 @@ async fn compare_with_plant(
         cell: String::new(),
         name: run.to_owned(),
         records: u64::try_from(there.records).unwrap_or(0),
-        head: digits(&there.head),
+        head: HEXLOWER.encode(&there.head),
         keys: Vec::new(),
     };
     match copy.check_local_journal(folder) {
@@ -340,7 +340,8 @@ async fn send_records(
     there: PlantRunState,
     batch: &[Record],
 ) -> Result<PlantRunState, PlantError> {
-    let hashes: Vec<Vec<u8>> = batch.iter().map(|record| unhex(&record.hash).unwrap_or_default()).collect();
+    let hashes: Vec<Vec<u8>> =
+        batch.iter().map(|record| HEXLOWER.decode(record.hash.as_bytes()).unwrap_or_default()).collect();
     let texts: Vec<String> = batch.iter().map(Record::text).collect();
     let from = there.records + 1;
     let values: [&(dyn ToSql + Sync); 4] = [&there.id, &from, &hashes, &texts];

@@ -11,10 +11,10 @@
 
 use std::time::Duration;
 
+use data_encoding::HEXLOWER;
 use tokio_postgres::types::ToSql;
 
 use super::error::{PlantError, refused};
-use super::hex::digits;
 use super::link::DatabaseLink;
 
 /// Duration of a lease.
@@ -56,7 +56,7 @@ impl Lease {
         Ok(row.map(|row| Self {
             work: row.get(0),
             serial: row.get(1),
-            recipe_sha256: digits(row.get(2)),
+            recipe_sha256: HEXLOWER.encode(row.get(2)),
             due: row.get(3),
             number: row.get(4),
         }))
@@ -111,7 +111,7 @@ impl StartedPart {
             lease: Lease {
                 work: row.get(0),
                 serial: row.get(1),
-                recipe_sha256: digits(row.get(2)),
+                recipe_sha256: HEXLOWER.encode(row.get(2)),
                 due: row.get(3),
                 number: row.get(4),
             },

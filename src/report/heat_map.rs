@@ -7,6 +7,7 @@ use base64::engine::general_purpose::STANDARD;
 
 use regrind_core::geometry::{Aperture, Grid};
 use regrind_core::registration::{Deviation, PointStatus};
+use regrind_figures::statistics::rms;
 use regrind_formats::write_atomic;
 
 use super::axis::{Ruler, Scale, grouped, three_digits};
@@ -49,7 +50,6 @@ impl HeatMap {
     pub fn new(title: &str, quantity: &str, unit: &str, samples: &[[f64; 3]]) -> Result<Self, ReportError> {
         let raster = Raster::new(title, samples)?;
         let [low, high] = range(samples.iter().map(|s| s[2]));
-        let squares: f64 = samples.iter().map(|s| s[2] * s[2]).sum();
         let map = Self {
             title: title.into(),
             quantity: quantity.into(),
@@ -58,7 +58,7 @@ impl HeatMap {
             tones: Tones { colours: ColourMap::Diverging, range: [low, high], tolerance: None },
             per_mm: 1.0,
             pv: high - low,
-            rms: (squares / samples.len() as f64).sqrt(),
+            rms: rms(samples.iter().map(|s| s[2])),
             points: samples.len(),
             lines: Vec::new(),
             figures_of: ["", "points"],

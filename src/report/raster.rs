@@ -3,7 +3,7 @@
 use super::{ReportError, range};
 use regrind_core::geometry::Grid;
 
-/// Values on a grid of pixels. A value is NaN where there is no sample.
+/// Values on a grid of pixels. Unlike a map of measured values, it has a NaN where there is no sample.
 #[derive(Clone, Debug)]
 pub(super) struct Raster {
     /// Positions of the centres of the pixels.

@@ -6,8 +6,9 @@ use serde::Serialize;
 
 use regrind_cell::{
     Alarm, Command, CompensationRefusal, ConnectionRefusal, Device, Ending, Event, Figures, GateFailure, GateResult,
-    Judgement, Occupation, Reconciliation, RecordFailure, RecordedInterval, Role,
+    Judgement, Occupation, Reconciliation, RecordFailure, Role,
 };
+use regrind_figures::Interval;
 use regrind_formats::result::Coordinates;
 use regrind_journal::Record;
 use regrind_record::{
@@ -329,9 +330,8 @@ fn figures_words(figures: &Figures) -> String {
         figures.outliers
     );
     if let Some(form) = &figures.form {
-        let um = |of: &RecordedInterval| {
-            format!("{:.2} ({:.2} to {:.2}) µm", 1e3 * of.median_mm, 1e3 * of.low_mm, 1e3 * of.high_mm)
-        };
+        let um =
+            |of: &Interval| format!("{:.2} ({:.2} to {:.2}) µm", 1e3 * of.median_mm, 1e3 * of.low_mm, 1e3 * of.high_mm);
         let (pv, rms, scatter_um) = (um(&form.pv_998), um(&form.rms), 1e3 * form.noise_sigma_mm);
         let _ = write!(line, "; form without the probe noise of {scatter_um:.2} µm: PV 99.8 % {pv}, RMS {rms}");
     }

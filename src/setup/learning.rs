@@ -4,13 +4,13 @@
 //! recipe or a renamed variant in the program changes no identity. A change of what the document has needs a new
 //! version. [`SettingIdentity::earlier`] is the text that versions up to 0.2 wrote; it is frozen.
 
+use data_encoding::HEXLOWER;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 
 use crate::cell::FirstStep;
 use crate::compensation::{FilterOrder, GainRule, Smoothing, SplineSmoothness};
 use crate::config::CellConfig;
-use crate::device::hex;
 use crate::formats::SettingIdentity;
 use crate::recipe::{Recipe, SpindleAxis, Tilt, TiltKind, WheelDimensions};
 use crate::registration::Coordinate;
@@ -49,7 +49,7 @@ pub(super) fn learning_kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, tar
     let (grinding, measure, map) = (&recipe.grinding, &recipe.measure, &recipe.compensation);
     let document = KindDocument {
         version: VERSION,
-        part_sha256: hex(part),
+        part_sha256: HEXLOWER.encode(part),
         begin_with: match recipe.cycle.begin_with {
             FirstStep::Grind => "grind",
             FirstStep::Measure => "measure",
@@ -98,7 +98,7 @@ fn identity(name: &str, document: &impl Serialize) -> String {
     // Numbers, texts and lists have a JSON form.
     let text = serde_json::to_string(document).unwrap_or_default();
     let digest = Sha256::digest(format!("regrind {name} {VERSION}\n{text}"));
-    format!("{name} {VERSION} {}", hex(&digest))
+    format!("{name} {VERSION} {}", HEXLOWER.encode(&digest))
 }
 
 /// Settings that the passes of two cells share if one cell can learn from the other.
@@ -273,7 +273,7 @@ mod tests {
         );
         let texts: Vec<&str> = found.iter().map(|identity| identity.earlier.as_str()).collect();
         assert_eq!(
-            hex(&Sha256::digest(texts.join("\n"))),
+            HEXLOWER.encode(&Sha256::digest(texts.join("\n"))),
             "7e31c9027f1061b51b8fc1b35453a1d61a13c4e339d0a75af16747ae93438bb6"
         );
         assert!(found.iter().all(|of| of.fits(&of.earlier) && of.fits(&of.id) && !of.fits("")));

@@ -333,14 +333,14 @@ fn x3p_opens_in_other_reader() {
         let is = |found: Option<f64>, mm: f64| found.is_some_and(|m| (1e3 * m - mm).abs() <= 1e-12 * mm.abs().max(1.0));
         assert!(is(x[k], px) && is(y[k], py), "{k}: {:?} {:?}", x[k], y[k]);
         assert_eq!(
-            z[k].map(|m| 1e3 * m - map.values_mm[k]).map(|d| d.abs() < 1e-18),
-            map.valid[k].then_some(true),
+            z[k].map(|m| 1e3 * m - map.nodes.values_mm[k]).map(|d| d.abs() < 1e-18),
+            map.nodes.valid[k].then_some(true),
             "{k}"
         );
     }
     // The mask agrees with the values.
     let mask: Vec<bool> = serde_json::from_value(read["mask"].clone()).unwrap();
-    assert_eq!(mask, map.valid);
+    assert_eq!(mask, map.nodes.valid);
     assert!(read["comment"].as_str().unwrap().starts_with("SIMULATION"), "{read}");
     assert_eq!(read["date"], "2026-03-01T12:00:00+00:00");
 }

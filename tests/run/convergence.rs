@@ -7,6 +7,7 @@ use crate::sample::seeds;
 use crate::study::{After, Bench, RECIPES, Way};
 use rayon::prelude::*;
 use regrind::compensation::GainRule;
+use regrind::figures::statistics::rms;
 
 const PASSES: u16 = 3;
 
@@ -19,12 +20,6 @@ fn runs(way: Way, parts: usize) -> Vec<(String, Vec<Vec<After>>)> {
         (format!("{}, seed {seed}", bench.name), bench.parts(seed, way, parts, PASSES))
     });
     each.collect()
-}
-
-/// Returns the root mean square over many passes.
-fn rms(values: impl Iterator<Item = f64> + Clone) -> f64 {
-    let count = values.clone().count() as f64;
-    (values.map(|v| v * v).sum::<f64>() / count).sqrt()
 }
 
 #[test]

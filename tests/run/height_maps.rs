@@ -304,7 +304,7 @@ async fn interferometer_maps_close_the_loop() {
     // The record contains the measurement and the results computed from it.
     let cycle = ran.folder.join(format!("cycle-{}", last.cycle));
     let X3pFile::Map(map) = read_x3p(cycle.join("error_map.x3p")).unwrap() else { panic!("a map") };
-    assert!(map.grid.columns > 90 && map.measured_count() > 5000 && map.rms_mm() < 1e-3);
+    assert!(map.heights.grid.columns > 90 && map.measured_count() > 5000 && map.rms_mm() < 1e-3);
     assert!(fs::read_to_string(cycle.join("registration.json")).unwrap().contains("\"weak_directions\": []"));
     let figures: Value = serde_json::from_slice(&fs::read(cycle.join("figures.json")).unwrap()).unwrap();
     let rows = figures["figures"].as_array().unwrap();

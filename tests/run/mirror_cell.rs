@@ -11,9 +11,11 @@ use regrind::device::file_exchange::{
     CmmExchange, CmmFolders, Exchange, MeasureOrder, Pattern, Permit, StationFiles, Stations,
 };
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
+use regrind::figures::Interval;
+use regrind::figures::statistics::rms;
 use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::geometry::{Point, Pose, Twist, Vector};
-use regrind::model::{Form, Interval, ModelError, ModelInputs, Prior, Sessions};
+use regrind::model::{Form, ModelError, ModelInputs, Prior, Sessions};
 use regrind::registration::{
     MapLimits, PointStatus, Registration, RegistrationOptions, Start, lateral_error, map_obstacle, register,
 };
@@ -234,8 +236,8 @@ fn stations(data: &Path, name: &str) -> Vec<u32> {
     (1..).map_while(|station| Some(vec![station; rows(station)?])).flatten().collect()
 }
 
-fn rms_um(of: impl Iterator<Item = f64> + Clone) -> f64 {
-    1e3 * (of.clone().map(|mm| mm * mm).sum::<f64>() / of.count() as f64).sqrt()
+fn rms_um(of: impl Iterator<Item = f64>) -> f64 {
+    1e3 * rms(of)
 }
 
 fn um(Interval { median_mm, low_mm, high_mm, .. }: Interval) -> String {

@@ -21,7 +21,8 @@ use regrind::compensation::{
 };
 use regrind::config::CellConfig;
 use regrind::drive::Task;
-use regrind::geometry::{DeviationSample, Grid, Point, Vector};
+use regrind::figures::statistics::rms;
+use regrind::geometry::{DeviationSample, Grid, GridMap, Point, Vector};
 use regrind::recipe::Recipe;
 use regrind::registration::{Deviation, PointStatus, Registration};
 use regrind::setup;
@@ -409,9 +410,9 @@ fn unfiltered(readings: &[DeviationSample], options: &MapOptions) -> ErrorMap {
         readings.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap().deviation_mm
     };
     let values_mm = (0..grid.len()).map(|k| nearest(grid.place_mm(k))).collect();
-    ErrorMap { values_mm, valid: vec![true; grid.len()], ..error_map(readings, options).unwrap() }
+    ErrorMap { nodes: GridMap::all_valid(grid, values_mm), ..error_map(readings, options).unwrap() }
 }
 
 fn rms_um(values_mm: &[f64]) -> f64 {
-    1e3 * (values_mm.iter().map(|v| v * v).sum::<f64>() / values_mm.len() as f64).sqrt()
+    1e3 * rms(values_mm)
 }

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use proptest::prelude::*;
 use regrind_cell::*;
+use regrind_figures::{Forecast, FormFigures, Interval, PartResponse};
 
 const SECOND: Duration = Duration::from_secs(1);
 
@@ -350,10 +351,10 @@ fn tolerance_compare_uses_pv_998() {
 fn conformity_by_acceptance_probability() {
     // u = 0.1 um below a limit of 1 um.
     let below = |deviates: f64| {
-        let rms = RecordedInterval::from_expanded(1e-3 - 1e-4 * deviates, 1.959_963_984_540_054e-4);
-        let form = RecordedFormFigures {
-            pv: RecordedInterval::from_expanded(1e-3, 1e-4),
-            pv_998: RecordedInterval::from_expanded(1e-3, 1e-4),
+        let rms = Interval::from_expanded(1e-3 - 1e-4 * deviates, 1.959_963_984_540_054e-4);
+        let form = FormFigures {
+            pv: Interval::from_expanded(1e-3, 1e-4),
+            pv_998: Interval::from_expanded(1e-3, 1e-4),
             rms,
             noise_sigma_mm: 3e-4,
         };
@@ -387,12 +388,12 @@ fn conformity_by_acceptance_probability() {
 }
 
 fn figures_with_form(pv_um: [f64; 3], rms_um: [f64; 3]) -> Figures {
-    let of = |[low, median, high]: [f64; 3]| RecordedInterval {
+    let of = |[low, median, high]: [f64; 3]| Interval {
         low_mm: low / 1e3,
         high_mm: high / 1e3,
-        ..RecordedInterval::from_expanded(median / 1e3, 0.0)
+        ..Interval::from_expanded(median / 1e3, 0.0)
     };
-    let form = RecordedFormFigures { pv: of(pv_um), pv_998: of(pv_um), rms: of(rms_um), noise_sigma_mm: 3e-4 };
+    let form = FormFigures { pv: of(pv_um), pv_998: of(pv_um), rms: of(rms_um), noise_sigma_mm: 3e-4 };
     Figures { form: Some(form), ..figures(9.0, 1.2) }
 }
 

@@ -6,6 +6,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use clap::{Args, Subcommand};
+use regrind::figures::statistics::quantile;
 use regrind::formats::{ResultFolder, ScratchFolder, write_atomic};
 use regrind::recipe::Recipe;
 use regrind_plant::{LeasedRun, PlantError, Study, run_overview};
@@ -407,9 +408,7 @@ fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
 
 fn median(mut values: Vec<f64>) -> Option<f64> {
     values.sort_by(f64::total_cmp);
-    let middle = values.len() / 2;
-    let low = values.get(middle.saturating_sub(usize::from(values.len().is_multiple_of(2))))?;
-    Some((low + values.get(middle)?) / 2.0)
+    quantile(&values, 0.5)
 }
 
 /// Returns the lower and upper limit of the 95 % Wilson score interval of a proportion, in per cent (0 to 100). The

@@ -5,6 +5,7 @@ use std::io;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use data_encoding::HEXLOWER;
 use regrind_cell::Actor;
 use sha2::{Digest, Sha256};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, ReadHalf, WriteHalf};
@@ -132,8 +133,7 @@ pub(crate) fn is_closed(_: &ClientReader) -> bool {
 fn pipe_name(folder: &Path) -> io::Result<String> {
     let whole = std::fs::canonicalize(folder)?;
     let digest = Sha256::digest(whole.as_os_str().as_encoded_bytes());
-    let digits: String = digest[..16].iter().map(|byte| format!("{byte:02x}")).collect();
-    Ok(format!(r"\\.\pipe\regrind-{digits}"))
+    Ok(format!(r"\\.\pipe\regrind-{}", HEXLOWER.encode(&digest[..16])))
 }
 
 /// Returns true if a process of this user listens on the control pipe of the run folder `folder`. Waits up to

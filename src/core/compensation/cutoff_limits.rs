@@ -2,6 +2,7 @@
 //! that both require.
 
 use rayon::prelude::*;
+use regrind_figures::statistics::median;
 
 use super::MapError;
 use crate::geometry::DeviationSample;
@@ -72,13 +73,11 @@ pub(super) fn point_spacings_mm(readings: &[DeviationSample]) -> [f64; 2] {
     let same_mm = SAME_PLACE * square_spacing_mm(readings);
     let nearest: Vec<[f64; 4]> =
         chosen.par_iter().map(|from| nearest_by_sector(from.place_mm, readings, same_mm)).collect();
-    let median = |sectors: [usize; 2]| {
-        let mut found: Vec<f64> =
-            nearest.iter().flat_map(|n| sectors.map(|s| n[s])).filter(|d| d.is_finite()).collect();
-        found.sort_by(f64::total_cmp);
-        found.get(found.len() / 2).copied().unwrap_or(0.0)
+    let usual = |sectors: [usize; 2]| {
+        let found = nearest.iter().flat_map(|n| sectors.map(|s| n[s])).filter(|d| d.is_finite());
+        median(&mut found.collect::<Vec<f64>>()).unwrap_or(0.0)
     };
-    [median([0, 1]), median([2, 3])]
+    [usual([0, 1]), usual([2, 3])]
 }
 
 /// Returns the average spacing of the readings, in millimetres: sqrt(A / n). A is the area of the bounding box of the

@@ -25,13 +25,14 @@
 //! so the share is then the average over all noise variances with this mean, exponentially distributed (the
 //! distribution of maximum entropy for a given mean): with c = |m|^2 / (p' |N|^2), 1 - (1 - exp(-c)) / c.
 
+use regrind_figures::{Forecast, PartResponse};
 use serde::{Deserialize, Serialize};
 
 use super::correction::Correction;
 use super::filter::FilterOrder;
 use super::map::{ErrorMap, MapOptions, filter_grid};
-use super::response::{Response, ResponseKind};
-use crate::geometry::Grid;
+use super::response::Response;
+use crate::geometry::{Grid, GridMap};
 
 /// Process noise q of one pass: increase of the variance of the estimate of R, relative to the variance of N.
 const PROCESS_NOISE: f64 = 0.02;
@@ -99,16 +100,6 @@ pub(super) struct MeanError {
     pub(super) values_mm: Vec<f64>,
 }
 
-/// Error on the grid of a correction.
-pub(super) struct ResampledError {
-    pub(super) grid: Grid,
-    pub(super) error_mm: Vec<f64>,
-    pub(super) valid: Vec<bool>,
-    /// Mean square of the standard uncertainty of a node that comes from the noise of the points, in square
-    /// millimetres.
-    pub(super) noise_mm2: f64,
-}
-
 /// State of the estimate of the repeatable error.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LearningState {
@@ -127,18 +118,6 @@ pub struct LearningState {
     /// Correction of the next pass, in millimetres, on the grid of the correction; `None` before a pass of this part.
     #[serde(skip)]
     pub(super) next_correction_mm: Option<Vec<f64>>,
-}
-
-/// Error that the next pass is expected to leave.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Forecast {
-    /// Expected root mean square of the error, in millimetres.
-    pub rms_mm: f64,
-    /// Standard deviation of `rms_mm` from part to part, in millimetres.
-    pub sigma_mm: f64,
-    /// Root mean square that no correction can go below, in millimetres, including the scallops between the tracks;
-    /// `None` while the non-repeatable error is unknown, as after only one pass.
-    pub floor_mm: Option<f64>,
 }
 
 /// One measured pass.
@@ -220,36 +199,37 @@ impl LearningState {
     /// correction is then the same as the correction of this pass.
     pub fn updated(&self, seen: &PassObservation) -> Self {
         let mut known = self.clone();
-        if seen.response.is_some_and(|answer| !matches!(answer.kind, ResponseKind::AsCommanded | ResponseKind::Unclear))
-        {
+        if seen.response.is_some_and(|answer| !matches!(answer.kind, PartResponse::Expected | PartResponse::Unclear)) {
             known.next_correction_mm = Some(seen.correction.apparent_mm().into_owned());
             return known;
         }
-        let told = ResampledError::resampled(seen.error, seen.correction.grid);
-        if let Some(answer) = seen.response.filter(|answer| answer.kind == ResponseKind::AsCommanded) {
+        // All learned values are on the grid of the correction, so only the measured error is interpolated. It becomes
+        // smaller from pass to pass, and with it the error of the interpolation.
+        let told = seen.error.nodes.resample(seen.correction.grid);
+        if let Some(answer) = seen.response.filter(|answer| answer.kind == PartResponse::Expected) {
             known.response = combine_responses(self.response, &answer, self.bands[0].independent(&told));
         }
         let response = known.response[0];
         let mut mean = MeanError::resampled(self.mean.as_ref(), told.grid, response / self.response[0]);
         let u = seen.correction.apparent_mm();
         let news: Vec<f64> =
-            told.error_mm.iter().zip(u.iter()).zip(&mean.values_mm).map(|((e, u), m)| e - response * u - m).collect();
-        known.whole.update(told.mean_square(&news), known.whole.independent(&told));
+            told.values_mm.iter().zip(u.iter()).zip(&mean.values_mm).map(|((e, u), m)| e - response * u - m).collect();
+        known.whole.update(mean_square(&told.valid, &news), known.whole.independent(&told));
         for (band, news) in known.bands.iter_mut().zip(self.split_bands(&told, news)) {
-            band.update(told.mean_square(&news), band.independent(&told));
+            band.update(mean_square(&told.valid, &news), band.independent(&told));
             add(&mut mean.values_mm, band.kalman_gain, &news);
         }
         // All points together determine the smooth part: it is used in full, and the bands shrink only the rest.
         let mut believed = seen.explained.map_or_else(|| vec![0.0; told.grid.len()], |smooth| smooth(&mean.values_mm));
         let rest: Vec<f64> = mean.values_mm.iter().zip(&believed).map(|(mean, smooth)| mean - smooth).collect();
-        let noise = known.band_noise_mm2(told.noise_mm2);
+        let noise = known.band_noise_mm2(points_noise_mm2(seen.error));
         for ((band, mean), noise_mm2) in known.bands.iter_mut().zip(self.split_bands(&told, rest)).zip(noise) {
-            band.shrink(told.mean_square(&mean), noise_mm2);
+            band.shrink(mean_square(&told.valid, &mean), noise_mm2);
             add(&mut believed, band.shrinkage, &mean);
         }
         known.next_correction_mm = Some(match self.rule {
             GainRule::Fixed(share) => {
-                let last = u.iter().zip(&told.error_mm);
+                let last = u.iter().zip(&told.values_mm);
                 last.map(|(u, e)| u - share / response * e).collect()
             }
             GainRule::Adaptive | GainRule::Wavelength => believed.iter().map(|r| -r / response).collect(),
@@ -293,12 +273,12 @@ impl LearningState {
     pub fn forecast(&self, error: &ErrorMap, scallops_mm: f64) -> Forecast {
         let rest2 = error.residual_sigma_mm.max(scallops_mm).powi(2);
         let (mut left2, mut scatter2, mut independent) = (0.0, 0.0, 0.0);
-        let told = ResampledError::resampled(error, error.grid);
-        let noise = self.band_noise_mm2(told.noise_mm2);
+        let told = &error.nodes;
+        let noise = self.band_noise_mm2(points_noise_mm2(error));
         for ((band, values), noise_mm2) in
-            self.bands.iter().zip(self.split_bands(&told, told.error_mm.clone())).zip(noise)
+            self.bands.iter().zip(self.split_bands(told, told.values_mm.clone())).zip(noise)
         {
-            let seen2 = told.mean_square(&values);
+            let seen2 = mean_square(&told.valid, &values);
             let [n2, taken] = [band.noise_mm2().unwrap_or(noise_mm2), self.compensated_share(band)];
             // Sum of: the repeatable error that is not compensated, the noise that the correction grinds in, the
             // noise of the next pass, and the error from the uncertainty of the response.
@@ -310,7 +290,7 @@ impl LearningState {
             };
             left2 += left + seen2 * (taken * self.response[1]).powi(2);
             scatter2 += n2;
-            independent += band.independent(&told);
+            independent += band.independent(told);
         }
         // Bands overlap, so their mean squares do not add up to that of the whole; the ratio of the noise corrects
         // for this.
@@ -387,12 +367,12 @@ impl LearningState {
     /// Splits the map `rest` into bands of wavelengths. `rest` has one value for each node. Returns one map for each
     /// band of this state, from the shortest waves to the longest. The sum of the returned maps is `rest`.
     ///
-    /// `told` gives the grid of `rest` and the nodes that are valid. The error values in `told` are not used.
-    pub(super) fn split_bands(&self, told: &ResampledError, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
+    /// `told` gives the grid of `rest` and the nodes that are valid. The values in `told` are not used.
+    pub(super) fn split_bands(&self, told: &GridMap, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
-        let whole = rest.clone();
+        let whole = GridMap { grid: told.grid, values_mm: rest.clone(), valid: told.valid.clone() };
         for longer in &self.bands[1..] {
-            let smooth = told.low_pass(&whole, longer.min_wavelength_mm);
+            let smooth = low_pass(&whole, longer.min_wavelength_mm);
             parts.push(rest.iter().zip(&smooth).map(|(value, smooth)| value - smooth).collect());
             rest = smooth;
         }
@@ -431,34 +411,6 @@ impl MeanError {
         let mut values_mm = mean.map_or_else(|| vec![0.0; grid.len()], |m| m.grid.resample(&m.values_mm, &grid));
         values_mm.iter_mut().for_each(|value| *value *= factor);
         Self { grid, values_mm }
-    }
-}
-
-impl ResampledError {
-    /// Interpolates the measured error map `error` to the nodes of `grid`, the grid of the correction, and returns the
-    /// result. A node is valid if the nearest node of `error` is valid.
-    ///
-    /// All learned values are on the grid of the correction, so only the measured error is interpolated. The measured
-    /// error becomes smaller from pass to pass, and with it the error of the interpolation.
-    fn resampled(error: &ErrorMap, grid: Grid) -> Self {
-        let noise_mm2 = mean_square(&error.valid, &error.sigma_mm);
-        let valid = (0..grid.len()).map(|k| error.grid.nearest(grid.place_mm(k)).is_some_and(|node| error.valid[node]));
-        Self { grid, error_mm: error.grid.resample(&error.values_mm, &grid), valid: valid.collect(), noise_mm2 }
-    }
-
-    pub(super) fn mean_square(&self, values: &[f64]) -> f64 {
-        mean_square(&self.valid, values)
-    }
-
-    /// Applies a Gaussian low-pass filter with the cut-off `cutoff_mm` to `values`, one for each node of the grid of
-    /// this map, and returns the filtered values. Uses only valid nodes. Returns 0 at every node if the filter cannot
-    /// be computed, because the map is too small for this cut-off.
-    fn low_pass(&self, values: &[f64], cutoff_mm: f64) -> Vec<f64> {
-        match filter_grid(&self.grid, values, &self.valid, cutoff_mm, FilterOrder::default(), false) {
-            Ok(smooth) => smooth.values,
-            // A map too small for this wavelength contains no longer waves.
-            Err(_) => vec![0.0; self.grid.len()],
-        }
     }
 }
 
@@ -529,9 +481,9 @@ impl Band {
 
     /// Returns how many statistically independent values an error map contains for the waves of this band, at least 1.
     /// `told` is the error map. The number is proportional to the area of its valid nodes.
-    pub(super) fn independent(&self, told: &ResampledError) -> f64 {
+    pub(super) fn independent(&self, told: &GridMap) -> f64 {
         let [dx, dy] = told.grid.spacing_mm;
-        let area_mm2 = dx * dy * told.valid.iter().filter(|valid| **valid).count() as f64;
+        let area_mm2 = dx * dy * told.valid_count() as f64;
         independent_values(area_mm2, self.min_wavelength_mm)
     }
 }
@@ -566,8 +518,24 @@ fn is_zero(value: &f64) -> bool {
     *value == 0.0
 }
 
+/// Returns the mean square of the standard uncertainty of a node that comes from the noise of the points, in mm².
+fn points_noise_mm2(error: &ErrorMap) -> f64 {
+    mean_square(&error.nodes.valid, &error.sigma_mm)
+}
+
+/// Applies a Gaussian low-pass filter with the cut-off `cutoff_mm` to the valid nodes of `map`, and returns the
+/// filtered values. Returns 0 at every node if the filter cannot be computed, because the map is too small for this
+/// cut-off.
+fn low_pass(map: &GridMap, cutoff_mm: f64) -> Vec<f64> {
+    match filter_grid(map, cutoff_mm, FilterOrder::default(), false) {
+        Ok(smooth) => smooth.nodes.values_mm,
+        // A map too small for this wavelength contains no longer waves.
+        Err(_) => vec![0.0; map.grid.len()],
+    }
+}
+
 /// Returns the mean of the squared `values` for which `valid` is true; 0 if there are none.
-fn mean_square(valid: &[bool], values: &[f64]) -> f64 {
+pub(super) fn mean_square(valid: &[bool], values: &[f64]) -> f64 {
     let used = || valid.iter().zip(values).filter(|(valid, _)| **valid);
     used().map(|(_, value)| value * value).sum::<f64>() / used().count().max(1) as f64
 }
@@ -579,6 +547,7 @@ fn add(sum: &mut [f64], factor: f64, values: &[f64]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use regrind_figures::statistics::rms;
 
     const GRID: Grid = Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
     /// Bands from 2.5, 5 and 10 mm; a further octave would be half the part.
@@ -601,10 +570,6 @@ mod tests {
         known.updated(&PassObservation { correction, error, response: None, explained: None })
     }
 
-    fn rms(values: &[f64]) -> f64 {
-        (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
-    }
-
     /// Noise that no two passes share: each of up to ten passes has its own wave, with a whole number of periods on
     /// the part.
     fn noise_wave(pass: u32, rms_mm: f64) -> Vec<f64> {
@@ -614,7 +579,7 @@ mod tests {
     }
 
     fn error_map_of(values_mm: Vec<f64>) -> ErrorMap {
-        ErrorMap { values_mm, ..map(|_| 0.0) }
+        ErrorMap::exact(GRID, values_mm, vec![true; GRID.len()])
     }
 
     #[test]
@@ -644,7 +609,7 @@ mod tests {
         let known = after(&begin(GainRule::Wavelength, None), &none(), &short);
         let shares: Vec<f64> = known.gains().iter().map(|[_, gain]| *gain).collect();
         assert!(shares[0] < 0.05, "{shares:?}");
-        assert!(rms(known.next_correction_mm().unwrap()) < 0.1 * rms(&short.values_mm));
+        assert!(rms(known.next_correction_mm().unwrap()) < 0.1 * rms(&short.nodes.values_mm));
         let long = noisy(map(|[x, _]| 5e-3 * (x * std::f64::consts::TAU / 30.0).cos()));
         let known = after(&begin(GainRule::Wavelength, None), &none(), &long);
         assert!(known.gains().last().unwrap()[1] > 0.98, "{:?}", known.gains());
@@ -695,7 +660,7 @@ mod tests {
                 let error = map(|[x, _]| 1e-3 + correction.at([x, 0.0]));
                 known = after(&known, &correction, &error);
                 let next = correction.compensating(&known, None);
-                for ((now, next), e) in correction.values_mm.iter().zip(&next.values_mm).zip(&error.values_mm) {
+                for ((now, next), e) in correction.values_mm.iter().zip(&next.values_mm).zip(&error.nodes.values_mm) {
                     assert_eq!(*next, now - share * e, "pass {pass}");
                 }
                 correction = next;
@@ -714,7 +679,7 @@ mod tests {
             correlation: 1.0,
             commanded_mm: 1e-3,
             unexplained_mm: 0.0,
-            kind: ResponseKind::AsCommanded,
+            kind: PartResponse::Expected,
         };
         let known = known.updated(&PassObservation {
             correction: &none(),
@@ -723,7 +688,7 @@ mod tests {
             explained: None,
         });
         assert!((known.response()[0] - 0.9).abs() < 1e-3, "{:?}", known.response());
-        for (u, e) in known.next_correction_mm().unwrap().iter().zip(&form.values_mm) {
+        for (u, e) in known.next_correction_mm().unwrap().iter().zip(&form.nodes.values_mm) {
             assert!((u + e / known.response()[0]).abs() < 1e-15);
         }
         // Four times the commanded change is no answer to it.
@@ -742,14 +707,8 @@ mod tests {
         let form = map(|[x, y]| 1e-3 * (0.2 * x + 0.1 * y).sin());
         let first = after(&begin(GainRule::Wavelength, None), &none(), &form);
         let asked = none().compensating(&first, None);
-        for sense in [
-            ResponseKind::NoEffect,
-            ResponseKind::Flipped,
-            ResponseKind::MirroredX,
-            ResponseKind::MirroredY,
-            ResponseKind::Turned,
-            ResponseKind::Doubled,
-        ] {
+        for sense in [PartResponse::NoEffect, PartResponse::SignFlipped, PartResponse::Mirrored, PartResponse::Doubled]
+        {
             let answer =
                 Response { slope: 0.0, correlation: 0.0, commanded_mm: 1e-3, unexplained_mm: 1e-3, kind: sense };
             let twice = first.updated(&PassObservation {
@@ -784,13 +743,13 @@ mod tests {
                 places.iter().map(|p| at(*p)).collect(),
                 places.iter().map(|p| hole(*p)).collect(),
             );
-            left.push(mean_square(&error.valid, &error.values_mm).sqrt());
+            left.push(mean_square(&error.nodes.valid, &error.nodes.values_mm).sqrt());
             let answer = slope.map(|slope| Response {
                 slope,
                 correlation: 1.0,
                 commanded_mm: 1.0,
                 unexplained_mm: 0.0,
-                kind: ResponseKind::AsCommanded,
+                kind: PartResponse::Expected,
             });
             known = known.updated(&PassObservation {
                 correction: &correction,
@@ -821,15 +780,14 @@ mod tests {
         let known = begin(GainRule::Wavelength, None);
         assert_eq!(known.bands.iter().map(|b| b.min_wavelength_mm).collect::<Vec<_>>(), [2.5, 5.0, 10.0]);
         let error = map(|[x, y]| (1.3 * x).sin() + 0.1 * y + (0.2 * x * y).cos());
-        let parts = known.split_bands(&ResampledError::resampled(&error, GRID), error.values_mm.clone());
-        for (k, value) in error.values_mm.iter().enumerate() {
+        let parts = known.split_bands(&error.nodes, error.nodes.values_mm.clone());
+        for (k, value) in error.nodes.values_mm.iter().enumerate() {
             assert!((parts.iter().map(|part| part[k]).sum::<f64>() - value).abs() < 1e-12);
         }
         // A long wave is in the last band, a short one in the first.
         let share = |wavelength_mm: f64, band: usize| {
             let wave = map(|[x, _]| (x * std::f64::consts::TAU / wavelength_mm).cos());
-            rms(&known.split_bands(&ResampledError::resampled(&wave, GRID), wave.values_mm.clone())[band])
-                / rms(&wave.values_mm)
+            rms(&known.split_bands(&wave.nodes, wave.nodes.values_mm.clone())[band]) / rms(&wave.nodes.values_mm)
         };
         assert!(share(30.0, 2) > 0.85 && share(3.0, 0) > 0.8, "{} {}", share(30.0, 2), share(3.0, 0));
     }
@@ -840,14 +798,12 @@ mod tests {
         // the middle, and points everywhere for the mean that includes the border.
         let known = begin(GainRule::Wavelength, None);
         let powers = |node: usize| {
-            let mut point = vec![0.0; GRID.len()];
-            point[node] = 1.0;
-            let smooth =
-                filter_grid(&GRID, &point, &vec![true; GRID.len()], CUTOFF_MM, FilterOrder::default(), false).unwrap();
-            let told = ResampledError::resampled(&error_map_of(smooth.values.clone()), GRID);
+            let mut point = GridMap::all_valid(GRID, vec![0.0; GRID.len()]);
+            point.values_mm[node] = 1.0;
+            let smooth = low_pass(&point, CUTOFF_MM);
             let power = |values: &[f64]| values.iter().map(|v| v * v).sum::<f64>();
-            let parts = known.split_bands(&told, smooth.values.clone());
-            [power(&parts[0]), power(&parts[1]), power(&parts[2]), power(&smooth.values)]
+            let parts = known.split_bands(&point, smooth.clone());
+            [power(&parts[0]), power(&parts[1]), power(&parts[2]), power(&smooth)]
         };
         let share = |nodes: &mut dyn Iterator<Item = usize>| {
             let sum = nodes.map(powers).fold([0.0; 4], |a, b| std::array::from_fn(|k| a[k] + b[k]));

@@ -25,8 +25,8 @@
 //! Its remaining share of a mean is stored with the mean: a machine passes on only what its own passes showed.
 //! Otherwise the finding of one machine would come back as that of all.
 
-use super::learning::{Band, LearningState, MeanError, RESPONSE_LIMITS, ResampledError, VALUES_PER_INDEPENDENT_VALUE};
-use crate::geometry::Grid;
+use super::learning::{Band, LearningState, MeanError, RESPONSE_LIMITS, VALUES_PER_INDEPENDENT_VALUE, mean_square};
+use crate::geometry::{Grid, GridMap};
 
 /// Minimum ratio of the variance of the mean to the variance of N: the ratio after one pass.
 const MIN_VARIANCE_RATIO: f64 = 1.0;
@@ -236,10 +236,9 @@ fn has_same_bands(one: &LearningState, other: &LearningState) -> bool {
     one.bands.len() == other.bands.len() && one.bands.iter().zip(&other.bands).all(same)
 }
 
-/// Returns an error map in which every node of `grid` is valid and which has no error values. The caller uses only the
-/// grid and the valid nodes of the result.
-fn zero_error(grid: Grid) -> ResampledError {
-    ResampledError { grid, error_mm: Vec::new(), valid: vec![true; grid.len()], noise_mm2: 0.0 }
+/// Returns a map in which every node of `grid` is valid and 0.
+fn zero_error(grid: Grid) -> GridMap {
+    GridMap::all_valid(grid, vec![0.0; grid.len()])
 }
 
 /// Returns, for each band of wavelengths, the repeatable error of a machine at the nodes of `grid`, with its variance.
@@ -257,7 +256,7 @@ fn band_evidence(known: &LearningState, grid: &Grid) -> Vec<Option<BandEvidence>
         let is_told = scatter_mm2 > 0.0 && band.transferred_share <= MAX_BORROWED_SHARE;
         // The machine's own part of the mean is what remains without the borrowed share, so its variance is larger.
         let variance_mm2 = belief * scatter_mm2 / (1.0 - band.transferred_share).powi(2);
-        let mean_mm2 = on_grid.mean_square(&values_mm);
+        let mean_mm2 = mean_square(&on_grid.valid, &values_mm);
         is_told.then_some(BandEvidence { values_mm, mean_mm2, variance_mm2, noise_mm2: scatter_mm2 })
     };
     known.bands.iter().zip(parts).map(of_band).collect()

@@ -4,6 +4,7 @@
 //!  readings -> outliers out -> filter (Gaussian, robust, spline) -> levelled off outside -> ErrorMap
 //! ```
 
+use regrind_figures::statistics::{median, rms};
 use serde::{Deserialize, Serialize};
 
 use super::MapError;
@@ -13,7 +14,7 @@ use super::inliers::InlierReadings;
 use super::level_off::{Levelled, level_off};
 use super::robust_filter::{FarReadings, Residuals, RobustResult, filter_robust, residuals};
 use super::spline::{SplineSmoothness, fit_spline};
-use crate::geometry::{DeviationSample, Grid};
+use crate::geometry::{DeviationSample, Grid, GridMap};
 
 /// Minimum cut-off of the surface that readings are compared with, in distances between readings.
 const MIN_REFERENCE_CUTOFF_SPACINGS: f64 = 4.0;
@@ -76,13 +77,9 @@ impl MapOptions {
 /// Smooth map of the error of the part.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ErrorMap {
-    /// Grid of the nodes.
-    pub grid: Grid,
-    /// Error at every node in millimetres, finite everywhere; at nodes that are not `valid`, levelled off from the
-    /// nearest valid node.
-    pub values_mm: Vec<f64>,
-    /// True for a node with enough readings around it.
-    pub valid: Vec<bool>,
+    /// Error at every node, finite everywhere. A node is valid if it has enough readings around it; at the others the
+    /// error is levelled off from the nearest valid node.
+    pub nodes: GridMap,
     /// Standard deviation of the deviations from the map, in millimetres: the part that the filter removed.
     pub residual_sigma_mm: f64,
     /// Standard uncertainty of the error at every node from the noise of single readings, in millimetres. At a node
@@ -227,7 +224,7 @@ pub fn map_from_model(
     let (map, sigma) = (error_map(&form, &options)?, error_map(&told.iter().map(sigma).collect::<Vec<_>>(), &options)?);
     // A polynomial fitted to the uncertainties can exceed their range between two places.
     let [least, most] = told.iter().fold([f64::INFINITY, 0.0], |[a, b], (_, of)| [a.min(*of), b.max(*of)]);
-    let sigma_mm = sigma.values_mm.iter().map(|value| value.clamp(least.min(most), most)).collect();
+    let sigma_mm = sigma.nodes.values_mm.iter().map(|value| value.clamp(least.min(most), most)).collect();
     let residual_sigma_mm = scatter_mm.hypot(map.residual_sigma_mm);
     Ok(ErrorMap { sigma_mm, residual_sigma_mm, point_sigma_mm: scatter_mm, ..map })
 }
@@ -267,9 +264,7 @@ impl ReferenceFilter {
 fn density(filtered: &FilterResult, gaussian: &GaussianFilter) -> f64 {
     let supported = (0..filtered.grid.len()).filter(|&k| filtered.supported[k]);
     let mut shares: Vec<f64> = supported.map(|k| filtered.leverage[k]).collect();
-    let middle = shares.len() / 2;
-    let median = if shares.is_empty() { 1.0 } else { *shares.select_nth_unstable_by(middle, f64::total_cmp).1 };
-    gaussian.open_leverage() / median
+    gaussian.open_leverage() / median(&mut shares).unwrap_or(1.0)
 }
 
 fn check(readings: &[DeviationSample], options: &MapOptions) -> Result<(), MapError> {
@@ -364,13 +359,10 @@ impl UnlevelledMap {
 
     fn into_map(self, grid: Grid, kept: &InlierReadings, outliers: Vec<usize>, level_off_mm: f64) -> ErrorMap {
         let Levelled { values, sources } = level_off(&grid, self.values, &self.slopes, &self.valid, level_off_mm);
-        let rest2: f64 =
-            kept.places.iter().zip(&kept.values).map(|(p, v)| (v - grid.interpolate(&values, *p)).powi(2)).sum();
+        let rest = kept.places.iter().zip(&kept.values).map(|(p, v)| v - grid.interpolate(&values, *p));
         ErrorMap {
-            grid,
-            values_mm: values,
-            valid: self.valid,
-            residual_sigma_mm: (rest2 / kept.values.len().max(1) as f64).sqrt(),
+            residual_sigma_mm: rms(rest),
+            nodes: GridMap { grid, values_mm: values, valid: self.valid },
             sigma_mm: sources.into_iter().map(|source| self.sigma[source]).collect(),
             point_sigma_mm: self.point_sigma,
             outliers,
@@ -385,28 +377,14 @@ impl ErrorMap {
     /// advice. `values_mm` (in millimetres) and `valid` have one entry for each node of `grid`.
     pub fn exact(grid: Grid, values_mm: Vec<f64>, valid: Vec<bool>) -> Self {
         Self {
-            grid,
             sigma_mm: vec![0.0; values_mm.len()],
-            values_mm,
-            valid,
+            nodes: GridMap { grid, values_mm, valid },
             residual_sigma_mm: 0.0,
             point_sigma_mm: 0.0,
             outliers: Vec::new(),
             point_spacing_mm: 0.0,
             advice: Vec::new(),
         }
-    }
-
-    /// Returns `values_mm`, interpolated bilinearly at a place `[x, y]` of the model frame, in millimetres. Beyond the
-    /// border of the grid, returns the value of the nearest place on the border.
-    pub fn at(&self, place_mm: [f64; 2]) -> f64 {
-        self.grid.interpolate(&self.values_mm, place_mm)
-    }
-
-    /// Returns x, y and the error of every valid node, in millimetres.
-    pub fn samples_mm(&self) -> Vec<[f64; 3]> {
-        let nodes = (0..self.grid.len()).filter(|&k| self.valid[k]);
-        nodes.map(|k| (self.grid.place_mm(k), self.values_mm[k])).map(|([x, y], e)| [x, y, e]).collect()
     }
 
     fn advised(mut self, options: &MapOptions, readings: usize, apart_mm: [f64; 2]) -> Self {
@@ -427,34 +405,29 @@ impl ErrorMap {
 /// Filtered surface on a grid.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FilteredGrid {
-    /// Filtered values at every node, in the units of the input; a node that is not valid has the value of the
-    /// nearest valid one.
-    pub values: Vec<f64>,
-    /// True for a node with enough valid values around it.
-    pub valid: Vec<bool>,
+    /// Filtered values. A node is valid if it has enough valid values around it; the others have the value of the
+    /// nearest valid node.
+    pub nodes: GridMap,
     /// Number of times that the filter was applied: 1 if it is not robust.
     pub rounds: usize,
 }
 
-/// Filters a map that is given at the nodes of a grid, for example from an interferometer, and returns the filtered map
-/// at the same nodes. The filter is the areal Gaussian filter of ISO 16610-61. If `robust_form` is true, it is the
-/// robust Gaussian filter of ISO 16610-71.
+/// Filters a map, for example of an interferometer, and returns the filtered map at the same nodes. The filter is the
+/// areal Gaussian filter of ISO 16610-61. If `robust_form` is true, it is the robust Gaussian filter of ISO 16610-71.
 ///
-/// Shapes: `values` and `valid` have one entry for each node of `grid`, row by row, x fastest. Values whose `valid` is
-/// false are not used. `order` is the order of the polynomial that passes the filter unchanged. Units: any unit for the
-/// values; millimetres for the cut-off.
+/// Values of nodes that are not valid are not used. `order` is the order of the polynomial that passes the filter
+/// unchanged. The cut-off is in millimetres.
 ///
 /// # Errors
 /// Returns an error if the number of values differs from the number of nodes, if a valid value is not finite, if the
 /// cut-off is not above 0, or if no node has enough valid values around it.
 pub fn filter_grid(
-    grid: &Grid,
-    values: &[f64],
-    valid: &[bool],
+    map: &GridMap,
     cutoff_mm: f64,
     order: FilterOrder,
     robust_form: bool,
 ) -> Result<FilteredGrid, MapError> {
+    let GridMap { grid, values_mm: values, valid } = map;
     if values.len() != grid.len() || valid.len() != grid.len() {
         return Err(MapError::Shape { found: values.len().min(valid.len()), nodes: grid.len() });
     }
@@ -474,7 +447,8 @@ pub fn filter_grid(
         return Err(MapError::TooSparse { valid: 0, nodes: grid.len(), cutoff_mm });
     }
     let levelled = level_off(grid, filtered.values, &filtered.slopes, &filtered.supported, 0.0);
-    Ok(FilteredGrid { values: levelled.values, valid: filtered.supported, rounds })
+    let nodes = GridMap { grid: *grid, values_mm: levelled.values, valid: filtered.supported };
+    Ok(FilteredGrid { nodes, rounds })
 }
 
 fn filter_robustly(

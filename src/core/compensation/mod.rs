@@ -32,7 +32,7 @@ pub use correction::Correction;
 pub use cutoff_limits::{contact_width_mm, point_spacing_mm};
 pub use error::MapError;
 pub use filter::FilterOrder;
-pub use learning::{Forecast, GainRule, LearningState, ParameterExplainer, PassObservation};
+pub use learning::{GainRule, LearningState, ParameterExplainer, PassObservation};
 pub use machine_transfer::{MachineSimilarity, TransferredState};
 pub use map::{ErrorMap, FilteredGrid, MapOptions, Smoothing, error_map, filter_grid, map_from_model};
 pub use next_pass::{CorrectionLimits, NextPass, NextPassError};
@@ -40,5 +40,5 @@ pub use parameters::{
     EstimatedParameter, ExplainedDeviation, ParameterCorrections, ParameterError, ParameterEstimation, ParameterKind,
     ParameterOptions, SurfacePoint, WheelTerm, estimate_parameters, explained_by_parameters,
 };
-pub use response::{Response, ResponseKind, estimate_response};
+pub use response::{Response, estimate_response};
 pub use spline::{SplineError, SplineSmoothness};

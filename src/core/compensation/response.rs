@@ -10,48 +10,25 @@
 //! map. Motions are therefore removed from both the commanded and the measured change before the comparison.
 
 use nalgebra::{Matrix6, Vector6};
+use regrind_figures::PartResponse;
 
 use super::correction::Correction;
 use super::map::ErrorMap;
 use crate::geometry::{Point, Vector};
 
-/// Kind of the part's response.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum ResponseKind {
-    /// As commanded.
-    AsCommanded,
-    /// With the opposite sign.
-    Flipped,
-    /// As if x ran the other way.
-    MirroredX,
-    /// As if y ran the other way.
-    MirroredY,
-    /// As if the map had been turned by half a turn, or by a quarter.
-    Turned,
-    /// As commanded, but much larger: as if the map had been applied twice.
-    Doubled,
-    /// No change, although one was commanded.
-    NoEffect,
-    /// The commanded change is too small compared with the noise for a decision.
-    Unclear,
-}
-
 /// Response of a part to a change of its correction.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Response {
     /// Change of the error over change of the correction; 1 is as commanded.
     pub slope: f64,
     /// Correlation of the two changes, from -1 to 1.
     pub correlation: f64,
     /// Root mean square of the commanded change without motions of the part, in millimetres.
-    #[serde(rename = "asked_mm")]
     pub commanded_mm: f64,
     /// Root mean square of the measured change that the commanded one does not explain, in millimetres.
     pub unexplained_mm: f64,
     /// Classification of the response.
-    #[serde(rename = "sense")]
-    pub kind: ResponseKind,
+    pub kind: PartResponse,
 }
 
 /// Maximum ratio of the unexplained variance of a mirrored or turned map to that of the straight map. With a larger
@@ -77,7 +54,7 @@ pub fn estimate_response(
     scatter_mm: f64,
 ) -> Response {
     let [before, after] = errors;
-    let grid = after.grid;
+    let grid = after.nodes.grid;
     let unseen = MotionProjector::new(places);
     let over =
         |value: &dyn Fn([f64; 2]) -> f64| unseen.without(places.iter().map(|(p, _)| value([p.x, p.y])).collect());
@@ -85,7 +62,7 @@ pub fn estimate_response(
     let asked = corrections.map(|correction| (correction.grid, correction.apparent_mm()));
     let [earlier, later] = asked.each_ref().map(|(grid, values)| move |place| grid.interpolate(values, place));
     let changed = |place: [f64; 2]| later(place) - earlier(place);
-    let answer = over(&|place| after.at(place) - before.at(place));
+    let answer = over(&|place| after.nodes.at(place) - before.nodes.at(place));
     let [cx, cy] = [0, 1].map(|k| {
         let nodes = grid.counts()[k];
         2.0 * grid.first_mm[k] + (nodes - 1) as f64 * grid.spacing_mm[k]
@@ -96,11 +73,12 @@ pub fn estimate_response(
     };
     let straight = fit(|place, _| place);
     let mirrored = [
-        (ResponseKind::MirroredX, fit(|[x, y], [cx, _]| [cx - x, y])),
-        (ResponseKind::MirroredY, fit(|[x, y], [_, cy]| [x, cy - y])),
-        (ResponseKind::Turned, fit(|[x, y], [cx, cy]| [cx - x, cy - y])),
-        (ResponseKind::Turned, fit(|[x, y], [cx, cy]| [(cx - cy) / 2.0 + y, (cx + cy) / 2.0 - x])),
-        (ResponseKind::Turned, fit(|[x, y], [cx, cy]| [(cx + cy) / 2.0 - y, (cy - cx) / 2.0 + x])),
+        fit(|[x, y], [cx, _]| [cx - x, y]),
+        fit(|[x, y], [_, cy]| [x, cy - y]),
+        // Half a turn, and quarter turns.
+        fit(|[x, y], [cx, cy]| [cx - x, cy - y]),
+        fit(|[x, y], [cx, cy]| [(cx - cy) / 2.0 + y, (cx + cy) / 2.0 - x]),
+        fit(|[x, y], [cx, cy]| [(cx + cy) / 2.0 - y, (cy - cx) / 2.0 + x]),
     ];
     Response {
         slope: straight.slope,
@@ -111,26 +89,26 @@ pub fn estimate_response(
     }
 }
 
-fn classify(straight: &Regression, mirrored: &[(ResponseKind, Regression)], scatter_mm: f64) -> ResponseKind {
+fn classify(straight: &Regression, mirrored: &[Regression], scatter_mm: f64) -> PartResponse {
     if straight.commanded_rms < 2.0 * scatter_mm || straight.commanded_rms == 0.0 {
-        return ResponseKind::Unclear;
+        return PartResponse::Unclear;
     }
-    let best = mirrored.iter().max_by(|a, b| a.1.correlation.total_cmp(&b.1.correlation)).expect("five ways are tried");
-    let left = [straight, &best.1].map(|fit| 1.0 - fit.correlation * fit.correlation.abs());
+    let best = mirrored.iter().max_by(|a, b| a.correlation.total_cmp(&b.correlation)).expect("five ways are tried");
+    let left = [straight, best].map(|fit| 1.0 - fit.correlation * fit.correlation.abs());
     let better = left[0] > WELL_EXPLAINED && left[1] < CLEARLY_BETTER * left[0];
-    if better && best.1.correlation > 0.8 && best.1.slope > 0.5 {
-        return best.0;
+    if better && best.correlation > 0.8 && best.slope > 0.5 {
+        return PartResponse::Mirrored;
     }
     if straight.slope > TWICE && straight.correlation > 0.5 {
-        return ResponseKind::Doubled;
+        return PartResponse::Doubled;
     }
     if straight.slope > 0.4 && straight.correlation > 0.5 {
-        return ResponseKind::AsCommanded;
+        return PartResponse::Expected;
     }
     if straight.slope < -0.4 && straight.correlation < -0.5 {
-        return ResponseKind::Flipped;
+        return PartResponse::SignFlipped;
     }
-    if straight.slope.abs() < 0.4 { ResponseKind::NoEffect } else { ResponseKind::Unclear }
+    if straight.slope.abs() < 0.4 { PartResponse::NoEffect } else { PartResponse::Unclear }
 }
 
 /// Regression through the origin.
@@ -210,7 +188,7 @@ mod tests {
     fn answered(seen: impl Fn(f64, f64) -> f64) -> Response {
         let before = map(error);
         let none = Correction::zero(GRID, 0.0);
-        let asked = Correction { values_mm: before.values_mm.iter().map(|e| -e).collect(), ..none.clone() };
+        let asked = Correction { values_mm: before.nodes.values_mm.iter().map(|e| -e).collect(), ..none.clone() };
         estimate_response([&before, &map(|x, y| error(x, y) + seen(x, y))], [&none, &asked], &places(), 2e-4)
     }
 
@@ -221,24 +199,24 @@ mod tests {
 
     #[test]
     fn response_classifies_every_sense() {
-        assert_eq!(answered(|x, y| -error(x, y)).kind, ResponseKind::AsCommanded);
-        assert_eq!(answered(|x, y| -0.8 * error(x, y)).kind, ResponseKind::AsCommanded);
-        assert_eq!(answered(error).kind, ResponseKind::Flipped);
-        assert_eq!(answered(|x, y| -error(-x, y)).kind, ResponseKind::MirroredX);
-        assert_eq!(answered(|x, y| -error(x, -y)).kind, ResponseKind::MirroredY);
-        assert_eq!(answered(|x, y| -error(-x, -y)).kind, ResponseKind::Turned);
-        assert_eq!(answered(|x, y| -error(y, -x)).kind, ResponseKind::Turned);
-        assert_eq!(answered(|x, y| -error(-y, x)).kind, ResponseKind::Turned);
-        assert_eq!(answered(|x, y| -2.0 * error(x, y)).kind, ResponseKind::Doubled);
-        assert_eq!(answered(|x, y| -1.2 * error(x, y)).kind, ResponseKind::AsCommanded);
-        assert_eq!(answered(|_, _| 0.0).kind, ResponseKind::NoEffect);
+        assert_eq!(answered(|x, y| -error(x, y)).kind, PartResponse::Expected);
+        assert_eq!(answered(|x, y| -0.8 * error(x, y)).kind, PartResponse::Expected);
+        assert_eq!(answered(error).kind, PartResponse::SignFlipped);
+        assert_eq!(answered(|x, y| -error(-x, y)).kind, PartResponse::Mirrored);
+        assert_eq!(answered(|x, y| -error(x, -y)).kind, PartResponse::Mirrored);
+        assert_eq!(answered(|x, y| -error(-x, -y)).kind, PartResponse::Mirrored);
+        assert_eq!(answered(|x, y| -error(y, -x)).kind, PartResponse::Mirrored);
+        assert_eq!(answered(|x, y| -error(-y, x)).kind, PartResponse::Mirrored);
+        assert_eq!(answered(|x, y| -2.0 * error(x, y)).kind, PartResponse::Doubled);
+        assert_eq!(answered(|x, y| -1.2 * error(x, y)).kind, PartResponse::Expected);
+        assert_eq!(answered(|_, _| 0.0).kind, PartResponse::NoEffect);
     }
 
     #[test]
     fn response_unclear_within_noise() {
         let flat = map(|_, _| 1e-5);
         let none = Correction::zero(GRID, 0.0);
-        assert_eq!(estimate_response([&flat, &flat], [&none, &none], &places(), 1e-4).kind, ResponseKind::Unclear);
-        assert_eq!(estimate_response([&flat, &flat], [&none, &none], &places(), 0.0).kind, ResponseKind::Unclear);
+        assert_eq!(estimate_response([&flat, &flat], [&none, &none], &places(), 1e-4).kind, PartResponse::Unclear);
+        assert_eq!(estimate_response([&flat, &flat], [&none, &none], &places(), 0.0).kind, PartResponse::Unclear);
     }
 }

@@ -12,6 +12,7 @@
 //! leans towards a wide feature, heights are also measured from the plane through the readings around it.
 
 use nalgebra::{Matrix3, Vector3};
+use regrind_figures::statistics::median;
 
 use super::filter::{FilterResult, GaussianFilter};
 use crate::geometry::{Grid, Point, PointTree};
@@ -300,9 +301,5 @@ fn on_plane(&[x, y]: &[f64; 2]) -> Point {
 /// Returns the median of the absolute values, ignoring NaN; 0 if there are no values.
 fn median_size(values: &[f64]) -> f64 {
     let mut sizes: Vec<f64> = values.iter().filter(|v| !v.is_nan()).map(|v| v.abs()).collect();
-    if sizes.is_empty() {
-        return 0.0;
-    }
-    let middle = sizes.len() / 2;
-    *sizes.select_nth_unstable_by(middle, f64::total_cmp).1
+    median(&mut sizes).unwrap_or(0.0)
 }

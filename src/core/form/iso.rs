@@ -10,6 +10,7 @@
 //!  varying part   I - S                                 RMSa = rms (I - S)
 //! ```
 
+use regrind_figures::statistics::rms;
 use serde::Serialize;
 
 use super::FormError;
@@ -142,11 +143,6 @@ pub(super) fn even_terms(square: f64) -> [f64; MAX_SYMMETRIC_DEGREE + 1] {
         row[n + 1] = ((2.0 * k + 1.0) * t * row[n] - k * row[n - 1]) / (k + 1.0);
     }
     row
-}
-
-fn rms(values: impl ExactSizeIterator<Item = f64>) -> f64 {
-    let count = values.len() as f64;
-    (values.map(|v| v * v).sum::<f64>() / count).sqrt()
 }
 
 fn notation(found: &Iso10110) -> String {

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::FormError;
-use crate::geometry::Grid;
+use crate::geometry::{Grid, GridMap};
 
 /// Slopes of a map over an integration length.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -25,24 +25,23 @@ pub struct Slope {
 /// Computes the slopes of a map, and returns their root mean square and maximum over all nodes that have a slope. The
 /// slopes are in radians.
 ///
-/// `values_mm` and `valid` have one entry for each node of `grid`: its height, and true if this height is known. The
-/// slope along x is a central difference: the value at half of `integration_mm` after the node, minus the value at half
-/// of `integration_mm` before the node, divided by `integration_mm`. The slope along y is computed in the same way.
-/// Before this, `integration_mm` is rounded to an even number of grid steps, at least two. A node has a slope if the
-/// four nodes of its two differences are all valid.
+/// The slope along x is a central difference: the value at half of `integration_mm` after the node, minus the value at
+/// half of `integration_mm` before the node, divided by `integration_mm`. The slope along y is computed in the same
+/// way. Before this, `integration_mm` is rounded to an even number of grid steps, at least two. A node has a slope if
+/// the four nodes of its two differences are all valid.
 ///
 /// # Errors
 /// Returns an error if `integration_mm` is not a finite number above 0, or if no node has a slope.
-pub fn slope(grid: &Grid, values_mm: &[f64], valid: &[bool], integration_mm: f64) -> Result<Slope, FormError> {
+pub fn slope(map: &GridMap, integration_mm: f64) -> Result<Slope, FormError> {
     if !(integration_mm > 0.0 && integration_mm.is_finite()) {
         return Err(FormError::Integration { integration_mm });
     }
-    let Grid { columns, rows, spacing_mm, .. } = *grid;
+    let Grid { columns, rows, spacing_mm, .. } = map.grid;
     let half = spacing_mm.map(|spacing| (0.5 * integration_mm / spacing).round().clamp(1.0, 1e9) as usize);
     let length_mm: [f64; 2] = std::array::from_fn(|k| 2.0 * half[k] as f64 * spacing_mm[k]);
     let known = |i: usize, j: usize| {
         let k = j * columns + i;
-        (i < columns && j < rows && valid[k]).then(|| values_mm[k])
+        (i < columns && j < rows && map.valid[k]).then(|| map.values_mm[k])
     };
     let (mut sums, mut largest, mut nodes) = ([0.0; 2], 0.0f64, 0usize);
     for j in half[1]..rows.saturating_sub(half[1]) {
@@ -74,13 +73,9 @@ mod tests {
     const NODES: usize = 41 * 31;
 
     fn slope_of(f: impl Fn(f64, f64) -> f64, valid: &[bool], integration_mm: f64) -> Result<Slope, FormError> {
-        let values: Vec<f64> = (0..NODES).map(|k| f((k % 41) as f64 - 20.0, (k / 41) as f64 - 15.0)).collect();
-        slope(
-            &Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0; 2] },
-            &values,
-            valid,
-            integration_mm,
-        )
+        let grid = Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0; 2] };
+        let values_mm = (0..NODES).map(|k| f((k % 41) as f64 - 20.0, (k / 41) as f64 - 15.0)).collect();
+        slope(&GridMap { grid, values_mm, valid: valid.to_vec() }, integration_mm)
     }
 
     #[test]

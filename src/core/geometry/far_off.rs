@@ -1,5 +1,7 @@
 //! Detection of a single point far off the others.
 
+use regrind_figures::statistics::median;
+
 use super::Point;
 
 /// Limit of the distance from the middle, in units of the median distance.
@@ -15,14 +17,10 @@ pub(crate) fn find_far_off(points: &[Point]) -> Option<(usize, f64)> {
     if points.len() < 3 {
         return None;
     }
-    let median = |mut values: Vec<f64>| {
-        let middle = values.len() / 2;
-        *values.select_nth_unstable_by(middle, f64::total_cmp).1
-    };
-    let [x, y, z] = [0, 1, 2].map(|k| median(points.iter().map(|p| p[k]).collect()));
-    let middle = Point::new(x, y, z);
+    let along = |k: usize| median(&mut points.iter().map(|p| p[k]).collect::<Vec<f64>>());
+    let middle = Point::new(along(0)?, along(1)?, along(2)?);
     let apart: Vec<f64> = points.iter().map(|p| (p - middle).norm()).collect();
-    let usual_mm = median(apart.clone());
+    let usual_mm = median(&mut apart.clone())?;
     let far = (0..apart.len()).max_by(|&a, &b| apart[a].total_cmp(&apart[b]))?;
     (usual_mm > 0.0 && apart[far] > MAX_MEDIAN_RATIO * usual_mm).then_some((far, apart[far]))
 }

@@ -8,6 +8,7 @@
 //! Units: millimetres.
 
 use nalgebra::{Matrix3, Vector3};
+use regrind_figures::statistics::root_mean;
 use thiserror::Error;
 
 use super::{Point, Pose, Vector};
@@ -129,7 +130,7 @@ fn centroid(points: &[Point]) -> Vector {
 }
 
 fn rms(residuals: &[Vector]) -> f64 {
-    (residuals.iter().map(Vector3::norm_squared).sum::<f64>() / residuals.len() as f64).sqrt()
+    root_mean(residuals.iter().map(Vector3::norm_squared))
 }
 
 /// Returns the root mean square distances of `points` from their centroid along their three principal axes, in mm. The

@@ -5,9 +5,10 @@
 
 use nalgebra::DMatrix;
 use rayon::prelude::*;
+use regrind_figures::Interval;
 use serde::Serialize;
 
-use super::{Interval, ModelInputs};
+use super::interval::FigureSamples;
 use crate::form::{IsoFits, IsoFormValues, SlopeOperator};
 
 /// Slopes of the smooth form. Their uncertainty includes the uncertainty of the pose and the noise of the probe. Form
@@ -65,20 +66,12 @@ impl SlopeFigures {
     /// upper end of the interval of the maximum slope.
     ///
     /// `is_seen` is true if a form was detected. If it is false, the lower ends of the intervals are 0.
-    pub(super) fn from_forms(
-        slopes: &SlopeOperator,
-        forms: &[DMatrix<f64>; 2],
-        (is_seen, inputs): (bool, &ModelInputs),
-    ) -> Self {
+    pub(super) fn from_forms(slopes: &SlopeOperator, forms: &[DMatrix<f64>; 2], is_seen: bool) -> Self {
         let found = forms.each_ref().map(|forms| map_columns(forms, |form| slopes.evaluate(form)));
         let [rms, largest] = [0, 1].map(|k| {
             let values = |of: usize| found[of].iter().map(|of| of[k]).collect();
-            let of = Interval::from_samples(
-                values(0),
-                (Vec::new(), (k == 1).then(|| values(1)).into_iter()),
-                is_seen,
-                inputs,
-            );
+            let higher = (k == 1).then(|| values(1)).into_iter();
+            let of = FigureSamples::new(values(0), (Vec::new(), higher), is_seen.then_some(1.0)).interval();
             AngleInterval { median_rad: of.median_mm, low_rad: of.low_mm, high_rad: of.high_mm }
         });
         Self { rms, max: largest, integration_mm: slopes.integration_mm, places: slopes.nodes }
@@ -97,14 +90,15 @@ impl IsoFigures {
     /// `is_seen` is true if a form was detected. If it is false, the lower ends of all intervals are 0, except that of
     /// `power_rim` (height of the power at the rim over the centre). The lower end of `power` is also 0 if the sign of
     /// the power is uncertain.
-    pub(super) fn from_forms(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool, inputs: &ModelInputs) -> Self {
+    pub(super) fn from_forms(fits: &IsoFits, forms: &[DMatrix<f64>; 2], is_seen: bool) -> Self {
         let found = forms.each_ref().map(|forms| map_columns(forms, |form| fits.evaluate(form)));
         let values = |k: usize, of: fn(&IsoFormValues) -> f64| found[k].iter().map(of).collect::<Vec<f64>>();
         let interval = |of: fn(&IsoFormValues) -> f64, has_low: bool| {
-            Interval::from_samples(values(0, of), (Vec::new(), std::iter::empty()), has_low, inputs)
+            FigureSamples::new(values(0, of), (Vec::new(), std::iter::empty()), has_low.then_some(1.0)).interval()
         };
         let extreme = |of: fn(&IsoFormValues) -> f64| {
-            Interval::from_samples(values(0, of), (Vec::new(), std::iter::once(values(1, of))), is_seen, inputs)
+            let higher = std::iter::once(values(1, of));
+            FigureSamples::new(values(0, of), (Vec::new(), higher), is_seen.then_some(1.0)).interval()
         };
         let power_rim = interval(|of| of.power_rim_mm, true);
         let has_sign = power_rim.low_mm * power_rim.high_mm > 0.0;

@@ -8,6 +8,8 @@
 
 use faer::Mat;
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SymmetricEigen, Vector6};
+use regrind_figures::FormFigures;
+use regrind_figures::statistics::median;
 
 use super::budget::{self, BudgetEntry};
 use super::hypotheses::FieldHypotheses;
@@ -16,8 +18,8 @@ use super::machine_uncertainty::{MachineEffects, UncertaintySource, invalid_unce
 use super::posterior::{HypothesisSet, Posterior, PosteriorSamples, select_hypotheses};
 use super::random_normals::NormalGenerator;
 use super::sampled_forms::{
-    FormFigures, FormPoint, MAX_PLACES, MIN_PROBABILITY, SAMPLES, SampledForms, inverse_of_products,
-    is_underdetermined, noise_prior, without_best_fit,
+    FormBounds, FormPoint, MAX_PLACES, MIN_PROBABILITY, SAMPLES, SampledForms, inverse_of_products, is_underdetermined,
+    noise_prior, without_best_fit,
 };
 use super::{Hyperparameters, ModelError, Observations, spacing_mm};
 use super::{IsoFigures, SlopeFigures};
@@ -37,8 +39,10 @@ pub struct Form {
     /// Form after its own best fit at every used point, in the order of the points. A scan of more than 6,000 points is
     /// reduced to 6,000, evenly spaced.
     pub points: Vec<FormPoint>,
-    /// Figures of the form.
+    /// Figures of the form over [`Form::points`], or over the places that were asked for.
     pub figures: FormFigures,
+    /// Bounds of these figures, for decisions while the measurement grows.
+    pub bounds: FormBounds,
     /// ISO 10110-5 figures (power, irregularity and others); None if there are too few points for them.
     pub iso: Option<IsoFigures>,
     /// Slopes of the smooth form; None if there are too few points for them.
@@ -426,7 +430,7 @@ impl FittedModel {
     fn slope(&self, inputs: &ModelInputs, posterior: &Posterior, drawn: &SampledForms) -> Option<SlopeFigures> {
         let slopes = SlopeOperator::new(&drawn.places, inputs.area.integration_mm)?;
         let smooth = [0, 1].map(|k| without_best_fit(drawn.forms[k].clone(), &drawn.effects));
-        Some(SlopeFigures::from_forms(&slopes, &smooth, (is_form_detected(posterior), inputs)))
+        Some(SlopeFigures::from_forms(&slopes, &smooth, is_form_detected(posterior)))
     }
 
     /// Builds the result of the model from the sampled forms in `drawn`. The slopes of the result are `None`.
@@ -450,10 +454,17 @@ impl FittedModel {
         let covariance = best_fit_covariance(&self.observed, (&self.fields, posterior), alike);
         // Points apart from the field are detected, whatever the others show.
         let is_seen = is_form_detected(posterior) || !self.unexplained.is_empty();
-        let figures = drawn.figures(is_seen, ends, inputs);
+        let hyperparameters = posterior.mean_hyperparameters();
+        let [rms, pv, pv_998] = drawn.figures(is_seen, ends);
+        let figures = FormFigures {
+            pv: pv.interval_with_quantiles(),
+            pv_998: pv_998.interval_with_quantiles(),
+            rms: rms.interval_with_quantiles(),
+            noise_sigma_mm: hyperparameters.noise_sigma_mm,
+        };
+        let bounds = FormBounds { pv: pv.bounds(inputs), pv_998: pv_998.bounds(inputs), rms: rms.bounds(inputs) };
         let budget = if is_whole { self.budget(inputs, posterior, drawn, ground_in, &figures) } else { Vec::new() };
         let iso = IsoFits::new(&drawn.places, inputs.area.middle_mm).filter(|_| is_whole);
-        let hyperparameters = posterior.mean_hyperparameters();
         let alone = match inputs.prior {
             None => hyperparameters,
             Some(_) => self.posterior(&ModelInputs { prior: None, ..*inputs }).mean_hyperparameters(),
@@ -464,8 +475,9 @@ impl FittedModel {
             frame_covariance: self.motions.to_twist(&covariance),
             points: drawn.points(),
             figures,
+            bounds,
             budget,
-            iso: iso.map(|fits| IsoFigures::from_forms(&fits, &drawn.forms, is_seen, inputs)),
+            iso: iso.map(|fits| IsoFigures::from_forms(&fits, &drawn.forms, is_seen)),
             slope: None,
             rms_smooth_sigma_mm: drawn.rms_smooth_sigma_mm(),
             is_detected: is_seen,
@@ -528,12 +540,7 @@ fn is_path(places: &[[f64; 2]]) -> bool {
     const NEAR: f64 = 3.0;
     let apart_mm = |pair: &[[f64; 2]]| (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1]);
     let mut steps_mm: Vec<f64> = places.windows(2).map(apart_mm).collect();
-    if steps_mm.is_empty() {
-        return false;
-    }
-    let middle = steps_mm.len() / 2;
-    let median_mm = *steps_mm.select_nth_unstable_by(middle, f64::total_cmp).1;
-    median_mm <= NEAR * spacing_mm(places)
+    median(&mut steps_mm).is_some_and(|median_mm| median_mm <= NEAR * spacing_mm(places))
 }
 
 fn xy((point, _): &(Point, Vector)) -> [f64; 2] {

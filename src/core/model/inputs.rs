@@ -27,8 +27,8 @@ pub struct ModelInputs {
     /// deviation. Any further noise is form that is too narrow to be resolved. A standard deviation of 0 means that it
     /// is unknown: all noise then counts as noise of the probe.
     pub probe_noise_mm: [f64; 2],
-    /// Probability that a figure is beyond each of the bounds [`Interval::decision_low_mm`] and
-    /// [`Interval::decision_high_mm`].
+    /// Probability that a figure is beyond each of the bounds [`low_mm`](super::DecisionBounds::low_mm) and
+    /// [`high_mm`](super::DecisionBounds::high_mm).
     pub decision_risk: f64,
     /// Minimum probability that a figure is within its limit, for the part to be accepted.
     pub acceptance_probability: f64,

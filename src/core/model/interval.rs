@@ -1,106 +1,91 @@
-//! Credible interval of a figure.
+//! Credible interval of a figure, and bounds for decisions on it, from samples of the figure.
+
+use regrind_figures::Interval;
+use regrind_figures::statistics::nearest_quantile;
 
 use super::inputs::ModelInputs;
 
-/// Median and 95 % credible interval of a figure.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
-pub struct Interval {
-    /// Median.
-    pub median_mm: f64,
-    /// 2.5 % quantile.
-    pub low_mm: f64,
-    /// 97.5 % quantile.
-    pub high_mm: f64,
+/// Bounds of a figure for decisions while a measurement grows, and for acceptance.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DecisionBounds {
     /// Lower bound for a decision that is repeated while the measurement grows: the quantile of the probability
     /// [`ModelInputs::decision_risk`].
-    #[serde(skip)]
-    pub decision_low_mm: f64,
+    pub low_mm: f64,
     /// Upper bound for a decision that is repeated while the measurement grows: the quantile of the probability 1 -
     /// [`ModelInputs::decision_risk`].
-    #[serde(skip)]
-    pub decision_high_mm: f64,
+    pub high_mm: f64,
     /// Bound for acceptance: the quantile of the probability [`ModelInputs::acceptance_probability`].
-    #[serde(skip)]
-    pub acceptance_bound_mm: f64,
-    /// Quantiles of the probabilities [`Interval::PROBABILITIES`].
-    #[serde(skip)]
-    pub quantiles_mm: [f64; 15],
+    pub acceptance_mm: f64,
 }
 
-impl Interval {
-    /// Probabilities of the quantiles that are recorded for a figure.
-    pub const PROBABILITIES: [f64; 15] =
-        [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999];
+/// Values of a figure in equally probable samples, and further values that can only widen its interval. Every list is
+/// sorted.
+pub(super) struct FigureSamples {
+    values: Vec<f64>,
+    lower: Vec<f64>,
+    higher: Vec<Vec<f64>>,
+    /// Factor of the quantiles below the median; `None` if they are 0.
+    low_factor: Option<f64>,
+}
 
-    /// Returns the standard uncertainty in mm: the width of the 95 % interval divided by 3.92. The 95 % interval of a
-    /// normal distribution is 3.92 standard deviations wide.
-    pub fn standard_uncertainty_mm(&self) -> f64 {
-        const WIDTH: f64 = 2.0 * 1.96;
-        (self.high_mm - self.low_mm) / WIDTH
-    }
-
-    /// Builds the credible interval of a figure from `values`: the value of the figure in each of several equally
-    /// probable samples. `values` must not be empty.
+impl FigureSamples {
+    /// Collects the samples of a figure. `values` has the value of the figure in each of several equally probable
+    /// samples; it must not be empty.
     ///
     /// `higher` has further sets of values. They can only raise the quantiles above the median: each quantile is the
     /// maximum of the quantiles of `values` and of every set in `higher`. No set in `higher` may be empty. `lower` is
     /// one further set of values. It can only lower the quantiles below the median: each quantile is the minimum of the
-    /// quantiles of `values` and of `lower`. An empty `lower` is ignored. If `has_low` is false, all quantiles below
-    /// the median are 0.
-    ///
-    /// `inputs` gives the probabilities of three bounds. [`ModelInputs::decision_risk`] is the probability that the
-    /// figure is below the bound `decision_low_mm`, and also that it is above the bound `decision_high_mm`.
-    /// [`ModelInputs::acceptance_probability`] is the probability that the figure is below the bound
-    /// `acceptance_bound_mm`.
-    pub(super) fn from_samples(
+    /// quantiles of `values` and of `lower`. An empty `lower` is ignored. The quantiles below the median are then
+    /// multiplied by `low_factor`. If it is `None`, they are 0.
+    pub(super) fn new(
         values: Vec<f64>,
         (lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
-        has_low: bool,
-        inputs: &ModelInputs,
+        low_factor: Option<f64>,
     ) -> Self {
-        Self::with_low_factor(values, (lower, higher), (has_low, 1.0), inputs)
+        let sorted = |mut of: Vec<f64>| {
+            of.sort_unstable_by(f64::total_cmp);
+            of
+        };
+        Self { values: sorted(values), lower: sorted(lower), higher: higher.map(sorted).collect(), low_factor }
     }
 
-    /// Builds the credible interval of a figure from `values`: the value of the figure in each of several equally
-    /// probable samples. `values` must not be empty.
-    ///
-    /// The sets in `higher` can only raise the quantiles above the median. The set `lower` can only lower the quantiles
-    /// below the median; an empty `lower` is ignored. If `has_low` is true, the quantiles below the median are then
-    /// multiplied by `low_factor`. If `has_low` is false, they are 0. `inputs` gives the probabilities of the bounds,
-    /// as in [`Interval::from_samples`].
-    pub(super) fn with_low_factor(
-        mut values: Vec<f64>,
-        (mut lower, higher): (Vec<f64>, impl Iterator<Item = Vec<f64>>),
-        (has_low, low_factor): (bool, f64),
-        inputs: &ModelInputs,
-    ) -> Self {
-        values.sort_unstable_by(f64::total_cmp);
-        lower.sort_unstable_by(f64::total_cmp);
-        let higher: Vec<Vec<f64>> = higher
-            .map(|mut of| {
-                of.sort_unstable_by(f64::total_cmp);
-                of
-            })
-            .collect();
-        let ModelInputs { decision_risk: look_risk, acceptance_probability: probability, .. } = *inputs;
-        let nth = |of: &[f64], share: f64| of[((of.len() - 1) as f64 * share).round() as usize];
-        let at = |share: f64| {
-            let own = nth(&values, share);
-            match share {
-                _ if share > 0.5 => higher.iter().fold(own, |most, of| most.max(nth(of, share))),
-                _ if share < 0.5 && !lower.is_empty() => own.min(nth(&lower, share)),
-                _ => own,
-            }
-        };
-        let low = |share: f64| if has_low { low_factor * at(share) } else { 0.0 };
-        Self {
-            median_mm: at(0.5),
-            low_mm: low(0.025),
-            high_mm: at(0.975),
-            decision_low_mm: low(look_risk),
-            decision_high_mm: at(1.0 - look_risk),
-            acceptance_bound_mm: at(probability),
-            quantiles_mm: Self::PROBABILITIES.map(|share| if share < 0.5 { low(share) } else { at(share) }),
+    /// Returns the median and the 95 % credible interval, without other quantiles.
+    pub(super) fn interval(&self) -> Interval {
+        let [low_mm, median_mm, high_mm] = [0.025, 0.5, 0.975].map(|share| self.quantile_mm(share));
+        Interval { median_mm, low_mm, high_mm, quantiles_mm: None }
+    }
+
+    /// Returns the median and the 95 % credible interval, with all quantiles that are recorded.
+    pub(super) fn interval_with_quantiles(&self) -> Interval {
+        let quantiles_mm = Interval::PROBABILITIES.map(|share| self.quantile_mm(share));
+        Interval { quantiles_mm: Some(quantiles_mm), ..self.interval() }
+    }
+
+    /// Returns the bounds of the figure at the probabilities in `inputs`: [`ModelInputs::decision_risk`] and
+    /// [`ModelInputs::acceptance_probability`].
+    pub(super) fn bounds(&self, inputs: &ModelInputs) -> DecisionBounds {
+        DecisionBounds {
+            low_mm: self.low_mm(inputs.decision_risk),
+            high_mm: self.own_quantile_mm(1.0 - inputs.decision_risk),
+            acceptance_mm: self.own_quantile_mm(inputs.acceptance_probability),
+        }
+    }
+
+    fn quantile_mm(&self, share: f64) -> f64 {
+        if share < 0.5 { self.low_mm(share) } else { self.own_quantile_mm(share) }
+    }
+
+    fn low_mm(&self, share: f64) -> f64 {
+        self.low_factor.map_or(0.0, |factor| factor * self.own_quantile_mm(share))
+    }
+
+    /// Returns a quantile without the factor of the quantiles below the median.
+    fn own_quantile_mm(&self, share: f64) -> f64 {
+        let own = nearest_quantile(&self.values, share);
+        match share {
+            _ if share > 0.5 => self.higher.iter().fold(own, |most, of| most.max(nearest_quantile(of, share))),
+            _ if share < 0.5 && !self.lower.is_empty() => own.min(nearest_quantile(&self.lower, share)),
+            _ => own,
         }
     }
 }

@@ -56,14 +56,14 @@ pub use field::{Anisotropy, Field};
 pub use form::Form;
 pub use incremental::IncrementalPosterior;
 pub use inputs::{AreaOptions, ModelInputs};
-pub use interval::Interval;
+pub use interval::DecisionBounds;
 pub use machine_uncertainty::{MachineUncertainty, UncertaintySource};
 pub use matern::Smoothness;
 pub use observations::{Hyperparameters, Observations};
 use observations::{orthonormal_base, spacing_mm};
 pub use part_priors::{PartFit, PartPriors};
 pub use prior::Prior;
-pub use sampled_forms::{FormFigures, FormPoint};
+pub use sampled_forms::{FormBounds, FormPoint};
 pub use sessions::{BetweenSessionVariance, PredictionInterval, Sessions};
 pub use stopping::{
     FIRST_BATCH, MAX_BATCHES, MIN_TOUCHES, PartialMeasurement, Reason, StoppingCriteria, StoppingDecision, decide,

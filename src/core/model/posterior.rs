@@ -748,9 +748,7 @@ mod tests {
                 |seed| Hyperparameters::estimate(&in_rows(planted, seed), Some(&Prior::for_size(102.0))).unwrap();
             let all: Vec<Hyperparameters> = (1..=PARTS).map(told).collect();
             let median = |of: &dyn Fn(&Hyperparameters) -> f64| {
-                let mut values: Vec<f64> = all.iter().map(of).collect();
-                values.sort_unstable_by(f64::total_cmp);
-                values[values.len() / 2]
+                regrind_figures::statistics::median(&mut all.iter().map(of).collect::<Vec<f64>>()).unwrap()
             };
             let off = [
                 median(&|h| h.noise_autocorrelation) - drift,

@@ -2,11 +2,12 @@
 
 use nalgebra::{DMatrix, SymmetricEigen};
 use rayon::prelude::*;
+use regrind_figures::statistics::rms;
 
 use super::hypotheses::FieldHypotheses;
 use super::inputs::ModelInputs;
 use super::intermediate::IntermediateNodes;
-use super::interval::Interval;
+use super::interval::{DecisionBounds, FigureSamples};
 use super::posterior::{NoisePrior, Posterior, PosteriorSamples};
 use super::random_normals::NormalGenerator;
 use super::{Observations, Prediction, orthonormal_base, spacing_mm};
@@ -351,8 +352,7 @@ impl SampledForms {
 
     /// Returns the root mean square over all places of [`SampledForms::smooth_sigma_mm`], in mm.
     pub(super) fn rms_smooth_sigma_mm(&self) -> f64 {
-        let squares: f64 = self.smooth_sigma_mm.iter().map(|sigma| sigma * sigma).sum();
-        (squares / self.smooth_sigma_mm.len().max(1) as f64).sqrt()
+        rms(&self.smooth_sigma_mm)
     }
 
     /// Returns the figures RMS, PV and PV 99.8 % (PV without the outermost 0.1 % at either end) of each sample, in mm.
@@ -366,8 +366,7 @@ impl SampledForms {
         plain.iter().zip(&other).map(|([rms, ..], [_, pv, most])| [*rms, *pv, *most]).collect()
     }
 
-    /// Returns the figures RMS, PV and PV 99.8 % (PV without the outermost 0.1 % at either end) with their credible
-    /// intervals, in mm.
+    /// Returns the samples of the figures RMS, PV and PV 99.8 % (PV without the outermost 0.1 % at either end), in mm.
     ///
     /// The medians and the intervals come from the posterior samples (the first set of `self.forms`). Four other sets
     /// of samples can only widen the intervals:
@@ -382,18 +381,17 @@ impl SampledForms {
     ///
     /// If the places are measured points and there are fewer than 200, the lower ends are multiplied by
     /// [`FEW_LOW_FACTOR`]. `is_seen` is true if a form was detected. If it is false, the lower ends are 0.
-    pub(super) fn figures(&self, is_seen: bool, [least, most]: [&[[f64; 3]]; 2], inputs: &ModelInputs) -> FormFigures {
+    pub(super) fn figures(&self, is_seen: bool, [least, most]: [&[[f64; 3]]; 2]) -> [FigureSamples; 3] {
         let [plain, rough] =
             [0, 1].map(|k| self.figures_of(&self.forms[k], self.intermediate.as_ref().map(|of| &of.forms[0])));
         let all = self.all_form.as_ref().map(|all| self.figures_of(all, None));
         let low_factor = if (1..FEW_POINTS).contains(&self.chosen.len()) { FEW_LOW_FACTOR } else { 1.0 };
-        let interval = |k: usize| {
+        [0, 1, 2].map(|k| {
             let of = |figures: &[[f64; 3]]| figures.iter().map(|of| of[k]).collect::<Vec<f64>>();
             let others = if k == 0 { most } else { &rough };
             let higher = [Some(others), all.as_deref()].into_iter().flatten().filter(|of| !of.is_empty()).map(of);
-            Interval::with_low_factor(of(&plain), (of(least), higher), (is_seen, low_factor), inputs)
-        };
-        FormFigures { rms: interval(0), pv: interval(1), pv_998: interval(2) }
+            FigureSamples::new(of(&plain), (of(least), higher), is_seen.then_some(low_factor))
+        })
     }
 
     /// Computes three figures of each sample, in mm: RMS, PV and PV 99.8 %. RMS and PV are computed from the places. PV
@@ -503,17 +501,15 @@ pub struct FormPoint {
     pub smooth_sigma_mm: f64,
 }
 
-/// Figures of the form with their credible intervals.
+/// Bounds of the figures of the form, for decisions.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct FormFigures {
+pub struct FormBounds {
+    /// Peak to valley.
+    pub pv: DecisionBounds,
+    /// PV 99.8 %.
+    pub pv_998: DecisionBounds,
     /// Root mean square.
-    pub rms: Interval,
-    /// Peak to valley over the places of [`Form::points`]. If the whole pattern was measured, these are the touched
-    /// points.
-    pub pv: Interval,
-    /// PV 99.8 %: peak to valley over the aperture, including the places between. The outermost 0.1 % at either end are
-    /// left out, but never a touched place.
-    pub pv_998: Interval,
+    pub rms: DecisionBounds,
 }
 
 /// Minimum probability at which a possibility counts: that the field is rough, or that isolated points are neighbours

@@ -188,21 +188,18 @@ pub fn decide(
 /// 99.8 %, RMS), from their limits in `purpose`, and from the uncertainty of the form. `count` is the number of touches
 /// so far. `pattern` is the number of all targets, touched or not.
 fn reason_from_form(form: &Form, purpose: &StoppingCriteria, (count, pattern): (usize, usize)) -> Reason {
-    let figures = [
-        (form.figures.pv, purpose.pv_mm),
-        (form.figures.pv_998, purpose.pv_998_mm),
-        (form.figures.rms, purpose.rms_mm),
-    ];
-    if figures.iter().all(|(figure, limit)| figure.decision_high_mm <= *limit) {
+    let bounds =
+        [(form.bounds.pv, purpose.pv_mm), (form.bounds.pv_998, purpose.pv_998_mm), (form.bounds.rms, purpose.rms_mm)];
+    if bounds.iter().all(|(of, limit)| of.high_mm <= *limit) {
         return Reason::WithinLimits;
     }
     let is_known = form.rms_smooth_sigma_mm <= purpose.correction_sigma_mm;
-    let is_beyond = figures.iter().any(|(figure, limit)| figure.decision_low_mm > *limit);
+    let is_beyond = bounds.iter().any(|(of, limit)| of.low_mm > *limit);
     let (share, least) = GIVE_UP_LIMITS;
     let gives_up = count >= least.max((share * pattern as f64) as usize);
     // The final judgement is a single decision, so its limit is less strict than that of one decision among many. A
     // part that it can accept gets more touches, not another pass.
-    let is_accepted = figures.iter().all(|(figure, limit)| figure.acceptance_bound_mm <= *limit);
+    let is_accepted = bounds.iter().all(|(of, limit)| of.acceptance_mm <= *limit);
     match () {
         () if is_beyond && !purpose.may_grind => Reason::BeyondLimit,
         () if is_known && (is_beyond || gives_up && purpose.may_grind && !is_accepted) => Reason::FormKnown,

@@ -8,6 +8,7 @@
 //! fit: how wide is the strip of contacts along the surface, in distances from point to point?
 
 use nalgebra::{Matrix3, SymmetricEigen};
+use regrind_figures::statistics::median;
 
 use super::deviation::{Deviation, PointStatus};
 use super::error::RegistrationError;
@@ -76,7 +77,7 @@ impl ScanLine {
             let chord = beads[2] - beads[0];
             chord.cross(&(beads[1] - beads[0])).norm() / chord.norm().max(f64::MIN_POSITIVE)
         });
-        let width_mm = 2.0 * median(&mut beside.collect::<Vec<_>>());
+        let width_mm = 2.0 * median(&mut beside.collect::<Vec<_>>()).unwrap_or(0.0);
         let distance_mm = path_mm / (points.len() - 1) as f64;
         (width_mm <= MIN_WIDE_RATIO * extent_mm).then_some(Self { axis, width_mm, distance_mm })
     }
@@ -116,7 +117,7 @@ pub(super) fn check_strip(deviations: &[Deviation], options: &RegistrationOption
         })
         .collect();
     // Rows can be nearer to each other than the points in a row.
-    let distance_mm = median(&mut nearest).max((width_mm * length_mm / contacts.len() as f64).sqrt());
+    let distance_mm = median(&mut nearest).unwrap_or(0.0).max((width_mm * length_mm / contacts.len() as f64).sqrt());
     let needed = undetermined_coordinates(along, normal);
     if width_mm < MIN_WIDTH_SPACINGS * distance_mm && !are_locked(&needed, options) {
         return Err(narrow_error(width_mm, distance_mm, needed));
@@ -154,10 +155,4 @@ fn centroid_and_axes(points: impl Iterator<Item = Point> + Clone) -> (Point, Mat
     let mut order = [0, 1, 2];
     order.sort_by(|a, b| eigenvalues[*a].total_cmp(&eigenvalues[*b]));
     (middle, Matrix3::from_columns(&order.map(|k| eigenvectors.column(k).into_owned())))
-}
-
-/// Sorts `values` and returns their median, the upper one of two middle values; 0 if there are no values.
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_unstable_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
 }

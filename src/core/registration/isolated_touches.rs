@@ -5,6 +5,7 @@
 //! then count in every figure. Only an isolated touch counts in no figure.
 
 use rayon::prelude::*;
+use regrind_figures::statistics::median;
 
 use crate::geometry::{Point, PointTree};
 
@@ -134,8 +135,7 @@ impl NeighbourIndex {
             near.iter().filter(|(_, apart)| *apart > SAME_PLACE * usual_mm).take(NEIGHBOURS).copied().collect();
         let Some((_, apart_mm)) = others.get(2).or(others.last()) else { return true };
         let mut around: Vec<f64> = others.iter().map(|(n, _)| self.heights_mm[*n]).collect();
-        around.sort_unstable_by(f64::total_cmp);
-        let level_mm = around[around.len() / 2];
+        let Some(level_mm) = median(&mut around) else { return true };
         // Compare with the local level. If the defect itself covers most of the neighbourhood, compare with the
         // surface.
         let is_same = |n: usize, from_mm: f64, share: f64| {

@@ -1,6 +1,7 @@
 //! Descent from the initial pose to the reported one: descend, reject outliers, and fit again.
 
 use rayon::prelude::*;
+use regrind_figures::statistics::median;
 
 use crate::geometry::{Point, PointTree, Pose};
 
@@ -254,8 +255,7 @@ fn isolated_flags(
     let is_isolated = |&k: &usize| {
         let others = tree.nearest(&measured[k], SEARCHED).filter(|(_, square)| *square > twin_mm * twin_mm);
         let mut around: Vec<f64> = others.take(NEIGHBOURS).map(|(n, _)| correspondences[n].distance_mm).collect();
-        around.sort_unstable_by(f64::total_cmp);
-        around.get(around.len() / 2).is_none_or(|median| (correspondences[k].distance_mm - median).abs() > limit_mm)
+        median(&mut around).is_none_or(|usual_mm| (correspondences[k].distance_mm - usual_mm).abs() > limit_mm)
     };
     suspects.par_iter().map(is_isolated).collect()
 }

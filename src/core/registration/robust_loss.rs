@@ -1,5 +1,6 @@
 //! Robust losses: a point far from the surface has less influence on the fit than its square, or none.
 
+use regrind_figures::statistics::median;
 use serde::{Deserialize, Serialize};
 
 /// Loss function of the distance of a point in the objective.
@@ -67,15 +68,11 @@ impl ScaledLoss {
 /// (MAD). Returns zeros if there are no distances.
 pub(crate) fn robust_median_and_sigma(distances: impl Iterator<Item = f64>) -> (f64, f64) {
     let mut values: Vec<f64> = distances.collect();
-    if values.is_empty() {
-        return (0.0, 0.0);
-    }
-    let middle = values.len() / 2;
-    let median = *values.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let middle = median(&mut values).unwrap_or(0.0);
     for v in &mut values {
-        *v = (*v - median).abs();
+        *v = (*v - middle).abs();
     }
-    (median, SIGMA_PER_MAD * *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+    (middle, SIGMA_PER_MAD * median(&mut values).unwrap_or(0.0))
 }
 
 #[cfg(test)]

@@ -7,6 +7,7 @@
 //! of those wins; others that fit as well are reported.
 
 use rayon::prelude::*;
+use regrind_figures::statistics::root_mean;
 
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::{CurvatureFeature, FacetIndex, OffsetSurface, Side, fit_features, principal_axes};
@@ -358,8 +359,7 @@ impl<'a> Search<'a> {
     /// dominate.
     fn score(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> f64 {
         let limit2 = self.truncation_mm().powi(2);
-        let sum: f64 = self.squared_distances_mm2(surface, cmm_from_model, points).map(|d2| d2.min(limit2)).sum();
-        (sum / points.len() as f64).sqrt()
+        root_mean(self.squared_distances_mm2(surface, cmm_from_model, points).map(|d2| d2.min(limit2)))
     }
 
     /// Returns the pose with its figures of fit to `points`: the rms of all distances, the rms of the points on the
@@ -380,7 +380,7 @@ impl<'a> Search<'a> {
         let trimmed_rms_mm = |mut squares: Vec<f64>| {
             squares.sort_unstable_by(f64::total_cmp);
             let kept = &squares[..(squares.len() * 9).div_ceil(10)];
-            (kept.iter().sum::<f64>() / kept.len().max(1) as f64).sqrt()
+            root_mean(kept.iter().copied())
         };
         let (rms_mm, on_part_rms_mm) = (trimmed_rms_mm(all), trimmed_rms_mm(on_part));
         Candidate { cmm_from_model, rms_mm, on_part_rms_mm, off_part_share: off_part, side: surface.side() }

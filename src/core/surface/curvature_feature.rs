@@ -1,6 +1,7 @@
 //! Curvature features: places of a surface, distinguished by their curvature in any pose.
 
 use rayon::prelude::*;
+use regrind_figures::statistics::median;
 
 use crate::geometry::{Point, PointTree, Vector};
 
@@ -101,9 +102,8 @@ fn fit_feature(at: Point, around: &[Point], known: Option<Vector>) -> Option<Cur
         (d.dot(&first.normal) - 0.5 * (k[0] * a * a + k[1] * b * b)).abs()
     };
     let mut residuals: Vec<f64> = around.iter().map(distance).collect();
-    let middle = residuals.len() / 2;
-    let median = *residuals.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let good = |p: &&Point| distance(p) <= 6.0 * median;
+    let usual = median(&mut residuals)?;
+    let good = |p: &&Point| distance(p) <= 6.0 * usual;
     // With the same neighbours the second fit would equal the first.
     let second = if around.iter().all(|p| good(&p)) {
         first

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
+use data_encoding::HEXLOWER;
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
@@ -18,7 +19,7 @@ use super::result_requirements::{ResultRequirements, assemble_measurement, check
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Watch, WatchedFile};
 use super::{Exchange, ExchangeError, HandOver, HandOverStatus, MeasureOrder, Pattern, Permit, PollResult};
-use crate::{Job, MeasuredPoint, Measurement, Plan, PlanTarget, TargetKind, hex};
+use crate::{Job, MeasuredPoint, Measurement, Plan, PlanTarget, TargetKind};
 use regrind_formats::FormatError;
 use regrind_formats::references::{References, parse_references, read_references};
 use regrind_formats::result::{Content, Coordinates, ResultFile, parse_result, read_bytes, read_statements};
@@ -384,7 +385,7 @@ impl Judge {
     /// same bytes, or if the content does not agree with the plan and the cell file.
     fn read(&self, expected: &Expected, path: &Path) -> Result<(ResultFile, String), ExchangeError> {
         let bytes = read_bytes(path)?;
-        let sha = hex(&Sha256::digest(&bytes));
+        let sha = HEXLOWER.encode(&Sha256::digest(&bytes));
         self.check_not_accepted_before(expected, path, &sha)?;
         Ok((self.requirements(expected).read(path, &bytes)?, sha))
     }
@@ -555,7 +556,10 @@ impl Judge {
             notes.extend(switched_off(&file.name, &result));
             notes.push(placed.summary());
             points.extend(result.points.iter().map(|p| placed.cmm_from_station.transform_point(p)));
-            files.extend([(file.name.clone(), sha), (reference_file.name.clone(), hex(&Sha256::digest(&bytes)))]);
+            files.extend([
+                (file.name.clone(), sha),
+                (reference_file.name.clone(), HEXLOWER.encode(&Sha256::digest(&bytes))),
+            ]);
             if let Some(first) = results.first().filter(|first| first.coordinates != result.coordinates) {
                 let words = |c: Option<Coordinates>| format!("{c:?}").to_lowercase();
                 return Err(FormatError::Contradiction {

@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
+use data_encoding::HEXLOWER;
 use thiserror::Error;
 
-use crate::hex;
 use regrind_core::geometry::RigidError;
 use regrind_formats::FormatError;
 
@@ -93,7 +93,7 @@ pub enum ExchangeError {
     /// The confirmation names another map than the one that was handed over.
     #[error(
         "the confirmation names the map {}, but the map {} was handed over; check which map the grinder has",
-        hex(&found[..8]), hex(&expected[..8])
+        HEXLOWER.encode(&found[..8]), HEXLOWER.encode(&expected[..8])
     )]
     OtherMap { expected: [u8; 32], found: [u8; 32] },
     /// No hand-over of the job is open.

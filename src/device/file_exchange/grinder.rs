@@ -9,13 +9,14 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use data_encoding::HEXLOWER;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::outbox::{AcceptedFiles, HandOverHeader, Outbox, StoredHandover, json_lines, read_json, unhex};
 use super::watch::{Watch, WatchedFile};
 use super::{ConfirmedStep, Exchange, ExchangeError, GrindOrder, HandOver, HandOverStatus, Permit, PollResult};
-use crate::{CorrectionMap, Job, Outcome, PassRecord, hex};
+use crate::{CorrectionMap, Job, Outcome, PassRecord};
 use regrind_formats::result::read_bytes;
 use regrind_formats::write_atomic;
 
@@ -150,7 +151,7 @@ impl GrinderFolders {
             let bytes = read_bytes(&file.path)?;
             let confirmation: Confirmation = read_json(&file.path)?;
             confirmation.check(&file.path, &stored.header)?;
-            Ok((confirmation, hex(&Sha256::digest(&bytes))))
+            Ok((confirmation, HEXLOWER.encode(&Sha256::digest(&bytes))))
         };
         read().map_err(|error| notes.push(format!("not accepted: {error}"))).ok()
     }
@@ -226,7 +227,7 @@ impl Exchange for GrinderFolders {
 
     fn confirm(&mut self, job: Job, what: ConfirmedStep, map_identity: [u8; 32]) -> Result<(), ExchangeError> {
         let stored = self.expect(job)?;
-        if hex(&map_identity) != stored.header.identity {
+        if HEXLOWER.encode(&map_identity) != stored.header.identity {
             return Err(ExchangeError::OtherMap { expected: unhex(&stored.header.identity), found: map_identity });
         }
         if stored.status != HandOverStatus::Open {
@@ -261,7 +262,7 @@ fn correction_json(ticket: &HandOverHeader, order: &GrindOrder, inbox: &Path) ->
         "units": "mm", "frame": "model",
         "sign": "a positive value leaves material, along the outward normal", "absolute": true,
         "columns": grid.columns, "rows": grid.rows, "first_mm": grid.first_mm, "spacing_mm": grid.spacing_mm,
-        "nominal_surface": hex(&map.part_identity),
+        "nominal_surface": HEXLOWER.encode(&map.part_identity),
         "pass": {
             "wheel_radius_mm": pass.wheel_radius_mm, "feed_mm_min": pass.feed_mm_min, "track_spacing_mm": pass.track_spacing_mm,
             "level_mm": pass.level_mm, "depth_of_cut_mm": pass.depth_of_cut_mm, "spark_out_passes": pass.spark_out_passes,

@@ -18,11 +18,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
+use data_encoding::{HEXLOWER, HEXLOWER_PERMISSIVE};
 use serde::{Deserialize, Serialize};
 
 use super::watch::{FileStamp, Watch};
 use super::{ExchangeError, HandOver, HandOverStatus, Permit, file_word};
-use crate::{Job, hex};
+use crate::Job;
 use regrind_formats::{FormatError, read_whole, sync_folder, try_writing, write_atomic, write_json_atomic};
 
 /// File in every folder of a hand-over.
@@ -78,7 +79,7 @@ impl HandOverHeader {
             cycle: job.cycle,
             digest: job.digest,
             start_number,
-            identity: hex(identity),
+            identity: HEXLOWER.encode(identity),
             tool_radius_mm,
             earlier: earlier.map(|file| (file.name, file.stamp.bytes, nanoseconds(file.stamp.modified))).collect(),
         })
@@ -286,12 +287,8 @@ pub(super) fn json_lines(value: &serde_json::Value) -> Vec<u8> {
     format!("{value:#}\n").into_bytes()
 }
 
-/// Decodes an identity from 64 hexadecimal digits. An invalid pair of digits gives a zero byte, so that the result
-/// matches no identity.
+/// Decodes an identity from 64 hexadecimal digits. Other text gives zeros, which match no identity.
 pub(super) fn unhex(digits: &str) -> [u8; 32] {
-    let mut identity = [0; 32];
-    for (byte, pair) in identity.iter_mut().zip(digits.as_bytes().chunks_exact(2)) {
-        *byte = std::str::from_utf8(pair).ok().and_then(|d| u8::from_str_radix(d, 16).ok()).unwrap_or_default();
-    }
-    identity
+    let decoded = HEXLOWER_PERMISSIVE.decode(digits.as_bytes()).ok();
+    decoded.and_then(|bytes| bytes.try_into().ok()).unwrap_or_default()
 }

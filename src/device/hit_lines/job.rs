@@ -8,6 +8,7 @@ use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use data_encoding::HEXLOWER;
 use serde::Serialize;
 use tokio::time::Instant;
 
@@ -15,7 +16,7 @@ use super::line_splitter::ReceivedLine;
 use super::protocol::{LineError, LineParser};
 use super::target_list::{TargetList, TouchAssignment};
 use crate::error::DeviceError;
-use crate::handshake::{Job, MachineState, Outcome, hex};
+use crate::handshake::{Job, MachineState, Outcome};
 use regrind_formats::JsonlAppender;
 
 /// Number of refused lines kept for a person: the last ones.
@@ -319,7 +320,7 @@ impl MeasurementSession {
     }
 
     pub(super) fn plan_digits(&self) -> String {
-        self.measurement.as_ref().map_or(String::new(), |asked| hex(&asked.plan_identity[..4]))
+        self.measurement.as_ref().map_or(String::new(), |asked| HEXLOWER.encode(&asked.plan_identity[..4]))
     }
 }
 

@@ -11,6 +11,8 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
+use data_encoding::HEXLOWER;
+
 use super::job::{MeasurementSession, RequestedMeasurement, locked};
 use super::link::Listener;
 use super::settings::HitLinesSettings;
@@ -19,7 +21,7 @@ use crate::error::{DeviceError, DeviceResult};
 use crate::file_exchange::plan_csv;
 use crate::handshake::{
     Answer, Armed, BatchId, Identity, Job, MachineCommand, MachineKind, MachineState, OperatorConfirmation, Outcome,
-    Reconciled, Started, Status, digest, hex,
+    Reconciled, Started, Status, digest,
 };
 use crate::job_memory::JobMemory;
 use crate::machine::{Cmm, Interrupt, Machine};
@@ -220,7 +222,7 @@ fn hits_file(job: Job) -> String {
 fn write_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<JsonlAppender, FormatError> {
     let path = settings.run_folder.join(plan_file(job));
     ResultFolder::prepare(path.parent().unwrap_or(&settings.run_folder))?.keep();
-    let text = plan_csv(&settings.part, job, &hex(&plan.identity()), plan);
+    let text = plan_csv(&settings.part, job, &HEXLOWER.encode(&plan.identity()), plan);
     write_atomic(&path, text.as_bytes())?;
     JsonlAppender::open(&settings.run_folder.join(hits_file(job)))
 }
@@ -229,7 +231,7 @@ fn write_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<Json
 /// nothing if the cell file names no such folder.
 fn show_list(settings: &HitLinesSettings, plan: &Plan, job: Job) -> Result<(), FormatError> {
     let Some(folder) = &settings.plan_folder else { return Ok(()) };
-    let text = plan_csv(&settings.part, job, &hex(&plan.identity()), plan);
+    let text = plan_csv(&settings.part, job, &HEXLOWER.encode(&plan.identity()), plan);
     write_atomic(&PathBuf::from(folder).join("plan.csv"), text.as_bytes())
 }
 

@@ -1,6 +1,5 @@
 //! Table of the cell file for an I++ DME server, and its driver factory.
 
-use std::net::IpAddr;
 use std::time::Duration;
 
 use regrind_document::Document;
@@ -12,6 +11,7 @@ use super::machine::IppdmeCmm;
 use super::settings::{IppdmeSettings, Scanning};
 use crate::driver_factory::{ConnectionCheck, DriverContext, DriverError, DriverFactory};
 use crate::machine_table::MachineTable;
+use crate::network_address::{HostTexts, check_address};
 use crate::no_machine::NoMachine;
 
 /// I++ DME over TCP, for a measuring machine.
@@ -98,7 +98,12 @@ impl DriverFactory for IppdmeWire {
             let allowed = "I++ DME is for measuring machines";
             return document.report("grinder.wire.kind", "is \"ippdme\"", allowed, "name another wire");
         }
-        self.check_address(place, document);
+        let texts = HostTexts {
+            allowed: "`host` must be only a name or an address, such as \"192.168.0.20\"",
+            remedy: "write the port into the key `port`",
+        };
+        let usual_port = "the usual port of I++ DME is 1294";
+        check_address((&self.host, self.port), (&texts, usual_port), place, document);
         if !document.contains_key("cmm.travel") {
             let allowed = "[cmm.travel] must give the volume of the machine, because Regrind checks every position before the machine moves";
             document.report("cmm.wire.kind", "is \"ippdme\" without [cmm.travel]", allowed, "add min_mm and max_mm");
@@ -152,35 +157,5 @@ impl DriverFactory for IppdmeWire {
 
     fn has_open_address(&self) -> bool {
         self.port == 0
-    }
-}
-
-impl IppdmeWire {
-    fn check_address(&self, place: &MachineTable<'_>, document: &mut Document) {
-        let host = &self.host;
-        let is_here = host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
-        if host.is_empty() {
-            // The schema reports this.
-        } else if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
-            let allowed = "`host` must be only a name or an address, such as \"192.168.0.20\"";
-            document.report(
-                &place.key("wire.host"),
-                format!("is {host:?}"),
-                allowed,
-                "write the port into the key `port`",
-            );
-        } else if place.simulated == Some(true) && !is_here {
-            document.report(
-                &place.key("wire.host"),
-                format!("is {host:?} in a simulated cell"),
-                "a simulated machine must be on this computer: 127.0.0.1, ::1 or localhost",
-                "if the machine is real, write `simulated = false`",
-            );
-        }
-        if self.port == 0 && place.simulated == Some(false) {
-            let found = "is 0 in a cell that is not simulated";
-            let allowed = "the port must be a whole number from 1 to 65535";
-            document.report(&place.key("wire.port"), found, allowed, "the usual port of I++ DME is 1294");
-        }
     }
 }

@@ -6,9 +6,8 @@
 //! this preparation. Reading that token back proves that both see one folder, and that no line of the record is from an
 //! earlier preparation.
 
+use data_encoding::HEXLOWER;
 use sha2::{Digest, Sha256};
-
-use crate::hex;
 
 /// Maximum length of a path; LinuxCNC reads lines of 255 characters.
 const MAX_PATH_LENGTH: usize = 220;
@@ -60,7 +59,7 @@ impl FramedProgram {
         let mut content = Sha256::new();
         content.update(order.pass);
         content.update(order.rounds.to_be_bytes());
-        let name = name_begins(order.run, order.cycle) + &hex(&content.finalize()[..8]);
+        let name = name_begins(order.run, order.cycle) + &HEXLOWER.encode(&content.finalize()[..8]);
         let record = path(order.folder, &name, RECORD);
         if record.len() > MAX_PATH_LENGTH {
             return Err(format!(
@@ -89,11 +88,7 @@ impl FramedProgram {
         let whole = std::str::from_utf8(&text).ok()?;
         let repeat = whole.lines().nth(4).and_then(|line| line.strip_prefix(REPEAT)?.strip_suffix(']')?.parse().ok());
         let map = whole.lines().find_map(|line| line.strip_prefix(MAP_COMMENT)?.strip_suffix(')'))?;
-        let digits = |k: usize| u8::from_str_radix(map.get(2 * k..2 * k + 2)?, 16).ok();
-        let mut identity = [0; 32];
-        for (k, byte) in identity.iter_mut().enumerate() {
-            *byte = digits(k)?;
-        }
+        let identity: [u8; 32] = HEXLOWER.decode(map.as_bytes()).ok()?.try_into().ok()?;
         let repeats = u32::from(repeat.is_some());
         let (head, tail) = (4 + repeats, 5 + repeats);
         let count = (whole.lines().count() as u32).checked_sub(head + tail)?;
@@ -151,9 +146,9 @@ fn plain(c: char) -> char {
 /// tolerance, does not end with M2, or contains M2, M30 or % before its end.
 fn body<'a>(pass: &'a [u8], map: &[u8; 32]) -> Result<&'a str, String> {
     let text = std::str::from_utf8(pass).ok().filter(|text| text.is_ascii()).ok_or("the program is not plain text")?;
-    let of_map = format!("{MAP_COMMENT}{})", hex(map));
+    let of_map = format!("{MAP_COMMENT}{})", HEXLOWER.encode(map));
     if !text.lines().any(|line| line.trim() == of_map) {
-        return Err(format!("the program does not belong to the map {}", hex(&map[..4])));
+        return Err(format!("the program does not belong to the map {}", HEXLOWER.encode(&map[..4])));
     }
     let code = text.lines().map(code).filter(|words| !words.is_empty());
     let code: Vec<Vec<&str>> = code.collect();
@@ -234,7 +229,7 @@ mod tests {
     const MAP: [u8; 32] = [7; 32];
 
     fn pass(mode: &str, end: &str) -> String {
-        format!("(part: x)\n(map: sha256 {})\nG21 G90\n{mode}\nG0 Z5\nG1 X1 Y2 F600\n{end}", hex(&MAP))
+        format!("(part: x)\n(map: sha256 {})\nG21 G90\n{mode}\nG0 Z5\nG1 X1 Y2 F600\n{end}", HEXLOWER.encode(&MAP))
     }
 
     fn frame(pass: &str, rounds: u32) -> Result<FramedProgram, String> {

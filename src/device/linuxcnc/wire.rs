@@ -1,6 +1,5 @@
 //! Table of the cell file for LinuxCNC, and its driver factory.
 
-use std::net::IpAddr;
 use std::time::Duration;
 
 use regrind_document::Document;
@@ -12,6 +11,7 @@ use super::settings::LinuxcncSettings;
 use crate::MachineKind;
 use crate::driver_factory::{ConnectionCheck, DriverContext, DriverError, DriverFactory};
 use crate::machine_table::MachineTable;
+use crate::network_address::{HostTexts, check_host, is_this_computer};
 use crate::no_machine::NoMachine;
 
 /// LinuxCNC by linuxcncrsh over TCP, for a grinder.
@@ -86,16 +86,11 @@ impl DriverFactory for LinuxcncWire {
             return document.report("cmm.wire.kind", "is \"linuxcnc\"", allowed, "name another wire");
         }
         self.check_path(place, document);
-        let host = &self.host;
-        if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
-            let allowed = "`host` must be only a name or an address, such as \"192.168.0.30\"";
-            document.report(
-                &place.key("wire.host"),
-                format!("is {host:?}"),
-                allowed,
-                "write the port into the key `port`",
-            );
-        }
+        let texts = HostTexts {
+            allowed: "`host` must be only a name or an address, such as \"192.168.0.30\"",
+            remedy: "write the port into the key `port`",
+        };
+        check_host(&self.host, &texts, place, document);
         for (key, password) in
             [("connect_password", &self.connect_password), ("control_password", &self.control_password)]
         {
@@ -110,11 +105,10 @@ impl DriverFactory for LinuxcncWire {
 
     fn notes(&self) -> Vec<String> {
         let default = Self::default();
-        let here = self.host == "localhost" || self.host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
         let known = self.control_password == default.control_password;
         let note = "linuxcncrsh has its default password and listens on every address: allow only this \
                     computer to connect to the port of linuxcncrsh";
-        (known && !here).then(|| note.to_owned()).into_iter().collect()
+        (known && !is_this_computer(&self.host)).then(|| note.to_owned()).into_iter().collect()
     }
 
     fn create_cmm(&self, _: &DriverContext<'_>) -> Result<NoMachine, DriverError> {

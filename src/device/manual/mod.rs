@@ -15,6 +15,7 @@ mod settings;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use data_encoding::HEXLOWER;
 use sha2::{Digest, Sha256};
 use tokio::time::Instant;
 
@@ -24,7 +25,7 @@ use super::file_exchange::{
 use super::{
     Answer, Armed, BatchId, Cmm, CorrectionMap, DeviceError, DeviceResult, Grinder, Identified, Identity, Interrupt,
     Job, Machine, MachineCommand, MachineKind, MachineState, Measurement, OperatorConfirmation, Outcome, Pass,
-    PassRecord, Plan, Reconciled, Started, Status, digest, hex,
+    PassRecord, Plan, Reconciled, Started, Status, digest,
 };
 use regrind_formats::result::{Content, read_bytes};
 use regrind_formats::run_files::{
@@ -199,7 +200,7 @@ impl ManualMachine {
         let there = find_program(&folder)
             .or_else(|| Some(folder.join(CycleFile::Correction.name())).filter(|file| file.is_file()));
         let by = there.map_or("your own program".to_owned(), |file| file.display().to_string());
-        let map = hex(&map[..4]);
+        let map = HEXLOWER.encode(&map[..4]);
         vec![
             format!("GRIND {}, cycle {}: with {by} (map {map})", self.settings.part, job.cycle),
             format!(
@@ -349,7 +350,7 @@ fn read_measurement(
     };
     let identity = plan.identity();
     let file = wanted.read(path, bytes)?;
-    if let Some(reason) = contradiction(&file.statements, &settings.part, job.cycle, &hex(&identity)) {
+    if let Some(reason) = contradiction(&file.statements, &settings.part, job.cycle, &HEXLOWER.encode(&identity)) {
         return Err(ExchangeError::Foreign { path: path.to_owned(), reason });
     }
     let points = wanted.assign_by_index(path, &file)?;
@@ -370,7 +371,7 @@ fn read_measurement(
 /// The folder or the file cannot be written.
 fn write_plan(settings: &ManualSettings, folder: &Path, plan: &Plan, job: Job) -> Result<(), FormatError> {
     ResultFolder::prepare(folder)?.keep();
-    let text = plan_csv(&settings.part, job, &hex(&plan.identity()), plan);
+    let text = plan_csv(&settings.part, job, &HEXLOWER.encode(&plan.identity()), plan);
     write_atomic(&folder.join(plan_file(job.batch_id().batch)), text.as_bytes())
 }
 

@@ -1,6 +1,5 @@
 //! Modbus settings of a machine in a cell file, and all settings of its driver.
 
-use std::net::IpAddr;
 use std::time::Duration;
 
 use schemars::JsonSchema;
@@ -9,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::parity::Parity;
 use super::serial_port;
 use crate::machine_table::MachineTable;
+use crate::network_address::{HostTexts, check_address};
 use regrind_document::Document;
 
 /// Number of registers that a Modbus device can have.
@@ -131,34 +131,12 @@ impl TcpWire {
     }
 
     pub(super) fn check_address(&self, place: &MachineTable<'_>, document: &mut Document) {
-        let host = &self.host;
-        let is_here = host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
-        if host.is_empty() {
-            // Reported by the schema.
-        } else if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
-            let allowed = "only a host name or an IP address is allowed, such as \"192.168.0.10\"";
-            document.report(
-                &place.key("wire.host"),
-                format!("is {host:?}"),
-                allowed,
-                "write the port into its own key, `port`",
-            );
-        } else if place.simulated == Some(true) && !is_here {
-            document.report(
-                &place.key("wire.host"),
-                format!("is {host:?} in a simulated cell"),
-                "a simulated machine must be on this computer: 127.0.0.1, ::1 or localhost",
-                "if the machine is real, write `simulated = false`",
-            );
-        }
-        if self.port == 0 && place.simulated == Some(false) {
-            document.report(
-                &place.key("wire.port"),
-                "is 0 in a cell that is not simulated",
-                "the port must be a whole number from 1 to 65535",
-                "the usual port of Modbus TCP is 502",
-            );
-        }
+        let texts = HostTexts {
+            allowed: "only a host name or an IP address is allowed, such as \"192.168.0.10\"",
+            remedy: "write the port into its own key, `port`",
+        };
+        let usual_port = "the usual port of Modbus TCP is 502";
+        check_address((&self.host, self.port), (&texts, usual_port), place, document);
     }
 
     /// Returns `None` always, because a program cannot know whether a network address exists before it tries to

@@ -12,9 +12,11 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
+use data_encoding::HEXLOWER;
 use regrind_core::geometry::{Point, Vector};
 use sha2::{Digest, Sha256};
 
+use super::GcodeError;
 use super::amendment::{Amendment, displacement};
 use super::arc::Arc;
 use super::check::Check;
@@ -23,7 +25,6 @@ use super::map::{MapBase, identity_in};
 use super::number::{push_fixed, rounded};
 use super::read::{Block, GcodeWord, Refusal, block};
 use super::write::UNCORRECTED;
-use super::{GcodeError, hex};
 use crate::is_same_file;
 use crate::registration::Draft;
 use crate::whole::read_whole;
@@ -241,10 +242,10 @@ fn header(base: &[u8; 32], amendment: &Amendment, unit_assumed: bool) -> String 
     if amendment.map.simulation {
         text.push_str("(SIMULATION)\n");
     }
-    let _ = writeln!(text, "(base: sha256 {})", hex(base));
-    let _ = writeln!(text, "(map: sha256 {})", hex(&amendment.map.identity));
+    let _ = writeln!(text, "(base: sha256 {})", HEXLOWER.encode(base));
+    let _ = writeln!(text, "(map: sha256 {})", HEXLOWER.encode(&amendment.map.identity));
     if let Some(part) = &amendment.map.part {
-        let _ = writeln!(text, "(part: sha256 {})", hex(part));
+        let _ = writeln!(text, "(part: sha256 {})", HEXLOWER.encode(part));
     }
     let _ = writeln!(text, "(gain: {}, within {} mm)", amendment.gain, super::number::short(amendment.tolerance_mm));
     text.push_str(match amendment.along_normals {
@@ -462,7 +463,7 @@ impl<'a> Rewriter<'a> {
         let count = shifts.len() - 1;
         let beside = (0..count).filter(|&k| {
             let at = way((k as f64 + 0.5) / count as f64);
-            !self.amendment.map.covers([at.x, at.y])
+            !self.amendment.map.nodes.is_valid_at([at.x, at.y])
         });
         let share = beside.count() as f64 / count as f64;
         // A move without change of position has no length, but has a place.

@@ -3,12 +3,13 @@
 use std::io::{BufRead, BufReader, Read as _};
 use std::path::Path;
 
+use data_encoding::HEXLOWER_PERMISSIVE;
 use sha2::{Digest, Sha256};
 
 use super::GcodeError;
 use crate::FormatError;
 use regrind_core::geometry::grid_recognition::NO_POINT;
-use regrind_core::geometry::{Grid, Point, recognise_grid};
+use regrind_core::geometry::{Grid, GridMap, Point, recognise_grid};
 
 /// Largest map that is read, in bytes.
 const MAX_BYTES: u64 = 512 << 20;
@@ -36,12 +37,8 @@ pub enum MapBase {
 /// Map as read from its file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ProgramMap {
-    /// Grid of the nodes.
-    pub grid: Grid,
-    /// The values in millimetres, row by row with x fastest.
-    pub values_mm: Vec<f64>,
-    /// True for nodes with enough measured points around them; true for all if the file does not state it.
-    pub valid: Vec<bool>,
+    /// Values. A node is valid if it has enough measured points around it, or if the file does not state it.
+    pub nodes: GridMap,
     /// Meaning of the values.
     pub kind: MapKind,
     /// Identity that the map states, or else the SHA-256 of the file.
@@ -52,18 +49,6 @@ pub struct ProgramMap {
     pub base: MapBase,
     /// True if the map comes from a simulated cell.
     pub simulation: bool,
-}
-
-impl ProgramMap {
-    /// Returns true if the map is valid at `place_mm`, a position x, y in millimetres: the nearest node of the grid has
-    /// enough measured points around it. Returns false if the position lies outside the grid by more than half the
-    /// distance of two nodes.
-    pub fn covers(&self, place_mm: [f64; 2]) -> bool {
-        let counts = self.grid.counts();
-        let [column, row] = [0, 1].map(|k| ((place_mm[k] - self.grid.first_mm[k]) / self.grid.spacing_mm[k]).round());
-        let inside = column >= 0.0 && row >= 0.0 && column < counts[0] as f64 && row < counts[1] as f64;
-        inside && self.valid[row as usize * counts[0] + column as usize]
-    }
 }
 
 /// Reads a map of errors or corrections from a CSV file. The header begins with `x_mm,y_mm,error_mm` or
@@ -168,9 +153,7 @@ impl MapLines {
         let known: Vec<bool> = values_mm.iter().zip(&valid).map(is_known).collect();
         level_off(&mut values_mm, &known, grid.columns);
         Ok(ProgramMap {
-            grid,
-            values_mm,
-            valid,
+            nodes: GridMap { grid, values_mm, valid },
             kind,
             identity: self.stated.unwrap_or_else(|| self.hash.finalize().into()),
             part: self.part,
@@ -245,9 +228,5 @@ fn level_off(values_mm: &mut [f64], known: &[bool], columns: usize) {
 /// it.
 pub(super) fn identity_in(comment: &str, name: &str) -> Option<[u8; 32]> {
     let digits = comment.split_once(name)?.1.trim_start().strip_prefix("sha256")?.trim_start().get(..64)?;
-    let mut bytes = [0; 32];
-    for (k, byte) in bytes.iter_mut().enumerate() {
-        *byte = u8::from_str_radix(digits.get(2 * k..2 * k + 2)?, 16).ok()?;
-    }
-    Some(bytes)
+    HEXLOWER_PERMISSIVE.decode(digits.as_bytes()).ok()?.try_into().ok()
 }

@@ -28,7 +28,3 @@ pub use error::GcodeError;
 pub use map::{MapBase, MapKind, ProgramMap, read_program_map};
 pub use table::write_axis_table;
 pub use write::{ProgramHeader, write_program};
-
-pub(super) fn hex(bytes: &[u8; 32]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
-}

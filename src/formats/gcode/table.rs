@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use super::hex;
+use data_encoding::HEXLOWER;
+
 use crate::FormatError;
 use crate::registration::write_rows;
 use regrind_core::geometry::Grid;
@@ -31,7 +32,7 @@ pub fn write_axis_table(
     let header = format!(
         "{marked}# offset of Z over the places of the axes X and Y, for the program of the nominal surface alone; toolpath.ngc holds it already\n# map: \
          sha256 {}\nx_mm,y_mm,dz_mm",
-        hex(map_identity)
+        HEXLOWER.encode(map_identity)
     );
     write_rows(path, &header, &rows, |values| (*values, None))
 }

@@ -2,11 +2,12 @@
 
 use std::path::Path;
 
+use data_encoding::HEXLOWER;
 use rayon::prelude::*;
 
+use super::GcodeError;
 use super::dialect::{ArcWords, CentreWords, Dialect, Exactness, LineEnd, NAME, NUMBER, Post};
 use super::number::{push_decimals, short};
-use super::{GcodeError, hex};
 use crate::registration::Draft;
 use regrind_core::compensation::path::{
     Arc, ArcSummary, Move, PathSummary, Plane, ProgramBlock, RotaryAxis, RotationAxis, ToolPath,
@@ -620,10 +621,10 @@ fn header_words(h: &ProgramHeader, s: &PathSummary, arcs: Option<&ArcSummary>, l
     }
     say(format_args!("Regrind {} tool path", env!("CARGO_PKG_VERSION")));
     say(format_args!("part: {}", h.part));
-    say(format_args!("part: sha256 {}", hex(&h.base_identity)));
+    say(format_args!("part: sha256 {}", HEXLOWER.encode(&h.base_identity)));
     say(format_args!("cycle: {}", h.cycle));
-    say(format_args!("base: sha256 {}", hex(&h.base_identity)));
-    say(format_args!("map: sha256 {}", hex(&h.map_identity)));
+    say(format_args!("base: sha256 {}", HEXLOWER.encode(&h.base_identity)));
+    say(format_args!("map: sha256 {}", HEXLOWER.encode(&h.map_identity)));
     if h.uncorrected {
         say(format_args!("{UNCORRECTED}"));
     }

@@ -3,6 +3,7 @@
 use std::io::{Cursor, Write};
 use std::path::Path;
 
+use data_encoding::HEXLOWER;
 use md5::{Digest, Md5};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
@@ -11,7 +12,7 @@ use crate::error::FormatError;
 use crate::height_map::HeightMap;
 use crate::registration::write_atomic;
 use regrind_core::compensation::ErrorMap;
-use regrind_core::geometry::Grid;
+use regrind_core::geometry::{Grid, GridMap};
 
 /// Statements of a file about the origin of its map.
 #[derive(Clone, Debug, PartialEq)]
@@ -37,8 +38,8 @@ pub struct MapRecord {
 /// # Errors
 /// The same as for [`write_x3p`].
 pub fn write_error_map_x3p(path: &Path, map: &ErrorMap, date: &str, simulation: bool) -> Result<(), FormatError> {
-    let samples = map.values_mm.iter().zip(&map.valid).map(|(value, valid)| valid.then_some(*value));
-    let heights = HeightMap::new(path, map.grid, samples)?;
+    let samples = map.nodes.values_mm.iter().zip(&map.nodes.valid).map(|(value, valid)| valid.then_some(*value));
+    let heights = HeightMap::new(path, map.nodes.grid, samples)?;
     let marked = if simulation { "SIMULATION. " } else { "" };
     let record = MapRecord {
         date: date.to_owned(),
@@ -67,10 +68,11 @@ pub fn write_x3p(path: &Path, map: &HeightMap, record: &MapRecord) -> Result<(),
 }
 
 fn packed(map: &HeightMap, record: &MapRecord) -> Result<Vec<u8>, zip::result::ZipError> {
-    let metres = map.heights_mm.iter().zip(&map.valid).map(|(z, valid)| if *valid { 1e-3 * z } else { f64::NAN });
+    let GridMap { values_mm, valid, .. } = &map.heights;
+    let metres = values_mm.iter().zip(valid).map(|(z, valid)| if *valid { 1e-3 * z } else { f64::NAN });
     let data: Vec<u8> = metres.flat_map(f64::to_le_bytes).collect();
-    let mut mask = vec![0u8; map.valid.len().div_ceil(8)];
-    for (k, _) in map.valid.iter().enumerate().filter(|(_, valid)| **valid) {
+    let mut mask = vec![0u8; valid.len().div_ceil(8)];
+    for (k, _) in valid.iter().enumerate().filter(|(_, valid)| **valid) {
         mask[k / 8] |= 1 << (k % 8);
     }
     let xml = main_xml(map, record, &sum(&data), &sum(&mask)).into_bytes();
@@ -91,7 +93,7 @@ fn packed(map: &HeightMap, record: &MapRecord) -> Result<Vec<u8>, zip::result::Z
 }
 
 pub(super) fn sum(bytes: &[u8]) -> String {
-    Md5::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
+    HEXLOWER.encode(&Md5::digest(bytes))
 }
 
 fn main_xml(map: &HeightMap, record: &MapRecord, data: &str, mask: &str) -> String {
@@ -101,11 +103,13 @@ fn main_xml(map: &HeightMap, record: &MapRecord, data: &str, mask: &str) -> Stri
              <Increment>{increment_m:e}</Increment>\n        <Offset>{offset_m:e}</Offset>\n      </{name}>\n"
         )
     };
-    let [x, y] = [0, 1].map(|k| axis(["CX", "CY"][k], "I", 1e-3 * map.grid.spacing_mm[k], 1e-3 * map.grid.first_mm[k]));
+    let [x, y] = [0, 1].map(|k| {
+        axis(["CX", "CY"][k], "I", 1e-3 * map.heights.grid.spacing_mm[k], 1e-3 * map.heights.grid.first_mm[k])
+    });
     let z = axis("CZ", "A", 1.0, 0.0);
     let MapRecord { date, creator, instrument, comment } = record;
     let [date, creator, instrument, comment] = [date, creator, instrument, comment].map(|text| escaped(text));
-    let (version, Grid { columns, rows, .. }) = (env!("CARGO_PKG_VERSION"), map.grid);
+    let (version, Grid { columns, rows, .. }) = (env!("CARGO_PKG_VERSION"), map.heights.grid);
     format!(
         "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n\
          <p:ISO5436_2 xmlns:p=\"http://www.opengps.eu/2008/ISO5436_2\" xmlns:xsi=\"http://www.w3.org/2001/XMLSchema-instance\" \

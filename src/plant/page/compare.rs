@@ -5,6 +5,7 @@ use axum::Extension;
 use axum::extract::{Query, RawQuery, State};
 use axum::response::Response;
 use maud::{Markup, html};
+use regrind_figures::statistics::quantile;
 use regrind_page::Session;
 
 use super::super::ToSql;
@@ -131,14 +132,6 @@ fn chances(cells: &[Cell]) -> Vec<Option<f64>> {
     holm(&found)
 }
 
-/// Returns the quantile at `share` (0 to 1) of sorted values, interpolated between the two nearest values; `None`
-/// without values.
-fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
-    let at = share * (sorted.len().checked_sub(1)?) as f64;
-    let (below, above) = (at.floor() as usize, at.ceil() as usize);
-    Some(sorted[below] + (at - at.floor()) * (sorted[above] - sorted[below]))
-}
-
 fn table(cells: &[Cell], chances: &[Option<f64>], selection: &Selection) -> Markup {
     let all = || cells.iter().flat_map(|cell| cell.pv_um.iter().copied());
     let scale = [all().fold(f64::INFINITY, f64::min), all().fold(0.0, f64::max)];
@@ -201,16 +194,6 @@ fn drawn(sorted: &[f64], [from, to]: [f64; 2]) -> Markup {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn quantile_interpolates() {
-        let sorted = [1.0, 2.0, 4.0];
-        assert_eq!(
-            [0.0, 0.25, 0.5, 1.0].map(|share| quantile(&sorted, share)),
-            [Some(1.0), Some(1.5), Some(2.0), Some(4.0)]
-        );
-        assert_eq!(quantile(&[], 0.5), None);
-    }
 
     #[test]
     fn chances_flag_worse_cell() {

@@ -5,6 +5,7 @@ use std::path::Path;
 use axum::Extension;
 use axum::extract::{RawQuery, State};
 use axum::response::Response;
+use data_encoding::HEXLOWER;
 use maud::{Markup, PreEscaped, html};
 use regrind_formats::{MapNode, parse_error_map};
 use regrind_page::Session;
@@ -154,7 +155,7 @@ async fn samples(
     let Some(content) = content(link, plant.artefacts.as_ref(), &sha256).await? else {
         return Ok(Err("its file has not arrived yet".into()));
     };
-    if regrind_journal::sha256_hex(&content) != super::super::hex::digits(&sha256) {
+    if regrind_journal::sha256_hex(&content) != HEXLOWER.encode(&sha256) {
         return Ok(Err("the plant's copy of its file was changed".into()));
     }
     let name = name.to_owned();

@@ -4,6 +4,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use data_encoding::HEXLOWER;
 use jiff::Timestamp;
 use regrind_formats::{FormatError, ScratchFolder};
 use regrind_report::{ReportError, ResultsFormat, run_report, run_results};
@@ -104,5 +105,5 @@ fn random_word() -> Result<String, PlantError> {
         source: std::io::Error::other(error.to_string()),
     };
     getrandom::fill(&mut bytes).map_err(failed)?;
-    Ok(super::super::hex::digits(&bytes))
+    Ok(HEXLOWER.encode(&bytes))
 }

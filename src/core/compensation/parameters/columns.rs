@@ -133,10 +133,6 @@ pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(x, y)| x * y).sum()
 }
 
-pub(super) fn rms(values: &[f64]) -> f64 {
-    (dot(values, values) / values.len() as f64).sqrt()
-}
-
 impl OrthonormalBasis {
     /// Builds an orthonormal basis from vectors of the same length (`columns`). The method is Gram-Schmidt, applied
     /// twice for accuracy. A vector that is a linear combination of the vectors before it adds nothing to the basis.

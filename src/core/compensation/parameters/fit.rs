@@ -1,9 +1,10 @@
 //! Fit of the columns of the parameters to the deviations.
 
 use nalgebra::{DMatrix, DVector};
+use regrind_figures::statistics::rms;
 
 use super::columns::Extent;
-use super::columns::{Column, OrthonormalBasis, dot, rms};
+use super::columns::{Column, OrthonormalBasis, dot};
 use super::error::ParameterError;
 use super::kinds::{
     COVERAGE_FACTOR, EstimatedParameter, MIN_EFFECT_MM2, ParameterKind, ParameterOptions, SurfacePoint,
@@ -108,7 +109,7 @@ impl Columns {
                 covariance[(slides + k, slides + k)] += if motion < 3 { shift * shift } else { turn * turn };
             }
         }
-        let sizes = all.iter().map(|column| rms(column)).collect();
+        let sizes = all.iter().map(|column| rms(*column)).collect();
         Ok(ColumnFit { values, covariance, sizes, rms_mm, slides })
     }
 
@@ -129,7 +130,7 @@ impl Columns {
     ) -> Result<EffectEstimates, ModelError> {
         let n = contacts.len();
         // Scale the columns to one size, since their units differ. Their overlap with the motions changes no value.
-        let sizes: Vec<f64> = chosen.iter().map(|column| rms(column)).collect();
+        let sizes: Vec<f64> = chosen.iter().map(|column| rms(*column)).collect();
         let of = unseen.columns.len();
         let scale = (n as f64).sqrt();
         let effects = DMatrix::from_fn(n, of + chosen.len(), |r, c| match c.checked_sub(of) {

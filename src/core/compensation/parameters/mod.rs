@@ -38,12 +38,14 @@ mod kinds;
 mod texts;
 
 pub use columns::Extent;
-use columns::{OrthonormalBasis, candidates, motions, rms, slides};
+use columns::{OrthonormalBasis, candidates, motions, slides};
 pub use corrections::{ExplainedDeviation, ParameterCorrections};
 pub use error::ParameterError;
 use fit::Columns;
 pub use kinds::{EstimatedParameter, ParameterKind, ParameterOptions, SurfacePoint, WheelTerm};
 use kinds::{MIN_NZ, MIN_POINTS};
+
+use regrind_figures::statistics::rms;
 
 use crate::geometry::Grid;
 
@@ -100,7 +102,7 @@ pub fn estimate_parameters(
     };
     let deviations: Vec<f64> = contacts.iter().map(|c| c.deviation_mm).collect();
     let unseen = OrthonormalBasis::new(columns.motions.iter().map(|m| &m.values));
-    let rms_mm = rms(&unseen.orthogonal_part(&deviations));
+    let rms_mm = rms(unseen.orthogonal_part(&deviations));
     let (told, own_shares) = columns.separability();
     let fitted = columns.fitted(contacts, &told, rms_mm, options)?;
     let alike = |k: usize| {
@@ -118,7 +120,7 @@ pub fn estimate_parameters(
     let rest_mm = left(None);
     let rest_rms_mm = rms(&rest_mm);
     let removes: Vec<f64> =
-        (0..found.len()).map(|k| if found[k].is_offered { rms(&left(Some(k))) - rest_rms_mm } else { 0.0 }).collect();
+        (0..found.len()).map(|k| if found[k].is_offered { rms(left(Some(k))) - rest_rms_mm } else { 0.0 }).collect();
     for (parameter, removes_rms_mm) in found.iter_mut().zip(removes) {
         parameter.rms_reduction_mm = removes_rms_mm;
         parameter.message = texts::message(parameter, rest_rms_mm, options);

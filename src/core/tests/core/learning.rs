@@ -5,6 +5,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use regrind_core::compensation::{Correction, ErrorMap, GainRule, LearningState, MapOptions, PassObservation};
 use regrind_core::geometry::Grid;
+use regrind_figures::statistics::rms;
 
 const GRID: Grid = Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
 const NOISE_MM: f64 = 1e-3;
@@ -22,10 +23,6 @@ fn random_waves(random: &mut StdRng, rms_mm: f64) -> Vec<f64> {
         .collect();
     let at = |[x, y]: [f64; 2]| waves.iter().map(|[a, b, phase]| (a * x + b * y + phase).sin()).sum::<f64>();
     (0..GRID.len()).map(|k| at(GRID.place_mm(k)) * rms_mm * (2.0f64 / 40.0).sqrt()).collect()
-}
-
-fn rms(values: &[f64]) -> f64 {
-    (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
 }
 
 #[test]

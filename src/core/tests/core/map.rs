@@ -8,7 +8,8 @@ use rand::{RngExt, SeedableRng};
 use regrind_core::compensation::{
     ErrorMap, FilterOrder, MapError, MapOptions, Smoothing, SplineSmoothness, error_map, filter_grid, map_from_model,
 };
-use regrind_core::geometry::{DeviationSample, Grid, GridError};
+use regrind_core::geometry::{DeviationSample, Grid, GridError, GridMap};
+use regrind_figures::statistics::rms;
 
 /// Returns readings of a function of the place, at the nodes of a grid about the origin.
 fn sampled(columns: usize, rows: usize, step_mm: [f64; 2], f: impl Fn(f64, f64) -> f64) -> Vec<DeviationSample> {
@@ -47,17 +48,12 @@ fn plain(cutoff_mm: f64, spacing_mm: f64) -> MapOptions {
     MapOptions { outlier_limit: None, ..MapOptions::new(cutoff_mm, spacing_mm) }
 }
 
-fn rms(values: impl Iterator<Item = f64>) -> f64 {
-    let (count, sum) = values.fold((0.0, 0.0), |(n, s), v| (n + 1.0, s + v * v));
-    (sum / f64::max(count, 1.0)).sqrt()
-}
-
 /// Returns the share of a wave that a map transmits, by least squares over valid nodes far from edges and holes.
 fn transmission(map: &ErrorMap, wave: impl Fn([f64; 2]) -> f64, counts: impl Fn([f64; 2]) -> bool) -> f64 {
-    let nodes = (0..map.grid.len()).filter(|&k| map.valid[k] && counts(map.grid.place_mm(k)));
+    let nodes = (0..map.nodes.grid.len()).filter(|&k| map.nodes.valid[k] && counts(map.nodes.grid.place_mm(k)));
     let (top, bottom) = nodes.fold((0.0, 0.0), |(top, bottom), k| {
-        let w = wave(map.grid.place_mm(k));
-        (top + w * map.values_mm[k], bottom + w * w)
+        let w = wave(map.nodes.grid.place_mm(k));
+        (top + w * map.nodes.values_mm[k], bottom + w * w)
     });
     assert!(bottom > 0.0);
     top / bottom
@@ -129,13 +125,13 @@ fn separable_filter_matches_definition() {
     for (spacing, cutoff, seed) in [(1.0, 5.0, 1), (0.7, 4.0, 2), (1.5, 11.0, 3)] {
         let readings = with_noise(&scattered(1500, [40.0, 30.0], seed, |x, y| (0.2 * x).sin() + 0.03 * y), 0.3, seed);
         let map = fitted_map(&readings, &plain(cutoff, spacing));
-        let exact = direct(&readings, &map.grid, cutoff);
-        let most = (0..map.grid.len())
-            .filter(|&k| map.valid[k])
-            .map(|k| (map.values_mm[k] - exact[k]).abs())
+        let exact = direct(&readings, &map.nodes.grid, cutoff);
+        let most = (0..map.nodes.grid.len())
+            .filter(|&k| map.nodes.valid[k])
+            .map(|k| (map.nodes.values_mm[k] - exact[k]).abs())
             .fold(0.0, f64::max);
         assert!(most < 1e-3, "spacing {spacing}, cut-off {cutoff}, seed {seed}: {most}");
-        assert!(map.valid.iter().filter(|v| **v).count() * 100 > 97 * map.grid.len());
+        assert!(map.nodes.valid.iter().filter(|v| **v).count() * 100 > 97 * map.nodes.grid.len());
     }
 }
 
@@ -149,7 +145,7 @@ fn filter_reproduces_order_to_edges() {
             readings.retain(hole);
             let map = fitted_map(&readings, &MapOptions { order, smoothing, ..MapOptions::new(6.0, 1.0) });
             assert!(map.outliers.is_empty());
-            for [x, y, e] in map.samples_mm() {
+            for [x, y, e] in map.nodes.samples_mm() {
                 assert!((e - f(x, y)).abs() < most, "{order:?} {smoothing:?} {x} {y}: {e} {}", f(x, y));
             }
         }
@@ -178,10 +174,10 @@ fn filter_is_shift_and_order_invariant() {
         let (map, moved, back) =
             (fitted_map(&here, &options), fitted_map(&there, &options), fitted_map(&turned, &options));
         let apart = |a: &ErrorMap, b: &ErrorMap| {
-            a.values_mm.iter().zip(&b.values_mm).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+            a.nodes.values_mm.iter().zip(&b.nodes.values_mm).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
         };
         assert!(apart(&map, &moved) < 1e-12 && apart(&map, &back) < 1e-13, "{smoothing:?}");
-        assert_eq!(map.valid, back.valid);
+        assert_eq!(map.nodes.valid, back.nodes.valid);
     }
 }
 
@@ -245,7 +241,7 @@ fn robust_filter_ignores_spikes() {
     let apart = |smoothing: Smoothing| {
         let options = MapOptions { smoothing, ..plain(8.0, 1.0) };
         let (with, without) = (fitted_map(&readings, &options), fitted_map(&clean, &options));
-        rms(with.values_mm.iter().zip(&without.values_mm).map(|(a, b)| a - b))
+        rms(with.nodes.values_mm.iter().zip(&without.nodes.values_mm).map(|(a, b)| a - b))
     };
     let (plain_form, robust_form) = (apart(Smoothing::Gaussian), apart(Smoothing::RobustGaussian));
     println!("spikes move the plain map by {plain_form}, the robust one by {robust_form}");
@@ -278,7 +274,7 @@ fn feature_of_part_is_inlier() {
     let mound = |x: f64, y: f64| 9e-3 * (-((x - 10.0).powi(2) + (y + 5.0).powi(2)) / 8.0).exp();
     let map = fitted_map(&with_noise(&trial(mound), 3e-4, 5), &MapOptions::new(5.0, 1.0));
     assert!(map.outliers.len() <= 1, "{:?}", map.outliers);
-    assert!(map.at([10.0, -5.0]) > 5e-3);
+    assert!(map.nodes.at([10.0, -5.0]) > 5e-3);
 }
 
 #[test]
@@ -300,7 +296,7 @@ fn two_agreeing_neighbours_are_inliers() {
         for shallow_mm in [depth_mm, 0.5 * depth_mm] {
             let map = chipped(&[(first, depth_mm), (second, shallow_mm)]);
             assert!(!map.outliers.contains(&first) && !map.outliers.contains(&second), "{:?}", map.outliers);
-            let held_mm = -map.at(quiet[first].place_mm);
+            let held_mm = -map.nodes.at(quiet[first].place_mm);
             assert!(held_mm > 0.5 * depth_mm && held_mm < 1.1 * depth_mm, "{held_mm} of {depth_mm}");
         }
         assert_eq!(chipped(&[(first, depth_mm)]).outliers, [first]);
@@ -325,7 +321,12 @@ fn repeats_do_not_confirm_outlier() {
     let map = fitted_map(&readings, &options);
     assert_eq!(map.outliers, [raised, raised + 1, raised + 2]);
     let at_mm = readings[raised].place_mm;
-    assert!((map.at(at_mm) - before.at(at_mm)).abs() < 0.02, "{} {}", map.at(at_mm), before.at(at_mm));
+    assert!(
+        (map.nodes.at(at_mm) - before.nodes.at(at_mm)).abs() < 0.02,
+        "{} {}",
+        map.nodes.at(at_mm),
+        before.nodes.at(at_mm)
+    );
 }
 
 #[test]
@@ -334,7 +335,7 @@ fn top_of_low_bump_is_inlier() {
     for seed in 0..20 {
         let bump = |x: f64, y: f64| 3e-3 * (1.0 - ((x - 10.0).powi(2) + (y + 5.0).powi(2)) / 16.0).max(0.0).powi(2);
         let map = fitted_map(&with_noise(&trial(bump), 3e-4, seed), &MapOptions::new(5.0, 1.0));
-        assert!(map.at([10.0, -5.0]) > 1.5e-3, "{seed}: {}", map.at([10.0, -5.0]));
+        assert!(map.nodes.at([10.0, -5.0]) > 1.5e-3, "{seed}: {}", map.nodes.at([10.0, -5.0]));
     }
 }
 
@@ -348,19 +349,22 @@ fn observed_over_stated_sigma(
     draws: u64,
 ) -> (f64, f64, f64) {
     let clean = fitted_map(readings, options);
-    let mut squares = vec![0.0; clean.grid.len()];
+    let mut squares = vec![0.0; clean.nodes.grid.len()];
     let mut point = 0.0;
-    let mut stated = vec![0.0; clean.grid.len()];
+    let mut stated = vec![0.0; clean.nodes.grid.len()];
     for seed in 0..draws {
         let map = fitted_map(&with_noise(readings, noise_mm, 1000 + seed), options);
-        squares.iter_mut().enumerate().for_each(|(k, s)| *s += (map.values_mm[k] - clean.values_mm[k]).powi(2));
+        squares
+            .iter_mut()
+            .enumerate()
+            .for_each(|(k, s)| *s += (map.nodes.values_mm[k] - clean.nodes.values_mm[k]).powi(2));
         stated.iter_mut().zip(&map.sigma_mm).for_each(|(s, sigma)| *s += sigma / draws as f64);
         point += map.point_sigma_mm / draws as f64;
     }
     let ratio = |k: usize| (squares[k] / draws as f64).sqrt() / stated[k];
-    let valid: Vec<f64> = (0..clean.grid.len()).filter(|&k| clean.valid[k]).map(ratio).collect();
+    let valid: Vec<f64> = (0..clean.nodes.grid.len()).filter(|&k| clean.nodes.valid[k]).map(ratio).collect();
     let outside = valid.iter().filter(|r| !(0.8..1.2).contains(*r)).count();
-    (rms(valid.iter().copied()), outside as f64 / valid.len() as f64, point / noise_mm)
+    (rms(&valid), outside as f64 / valid.len() as f64, point / noise_mm)
 }
 
 #[test]
@@ -403,7 +407,7 @@ fn spline_passes_half_at_cutoff() {
         |roughness| MapOptions { smoothing: Smoothing::Spline, spline_smoothness: roughness, ..plain(5.0, 1.0) };
     let off = |roughness| {
         let map = fitted_map(&readings, &options(roughness));
-        rms(map.samples_mm().into_iter().map(|[x, y, e]| e - form(x, y)))
+        rms(map.nodes.samples_mm().map(|[x, y, e]| e - form(x, y)))
     };
     let (by_cutoff, validated) = (off(SplineSmoothness::Cutoff), off(SplineSmoothness::CrossValidation));
     println!("spline off by {by_cutoff}, cross-validated {validated}");
@@ -417,20 +421,20 @@ fn map_levels_off_outside_points() {
     readings.retain(|r| r.place_mm[0].hypot(r.place_mm[1]) < 40.0);
     let level_off_mm = 12.5;
     let map = fitted_map(&readings, &MapOptions { level_off_mm, ..MapOptions::new(6.0, 1.0) });
-    let corner = map.grid.len() - 1;
-    assert!(!map.valid[corner] && map.valid[map.grid.len() / 2]);
+    let corner = map.nodes.grid.len() - 1;
+    assert!(!map.nodes.valid[corner] && map.nodes.valid[map.nodes.grid.len() / 2]);
     // From the nearest valid node, off by 4/27 of slope times distance at most, and without slope at the corner, 16 mm
     // away.
-    let most = map.samples_mm().into_iter().map(|[_, _, e]| e).fold(0.0, f64::max);
-    assert!(map.values_mm.iter().all(|v| v.abs() <= most + 4.0 / 27.0 * 1e-4 * level_off_mm + 1e-12));
-    let [x, y] = map.grid.place_mm(corner);
-    let near = map.samples_mm().into_iter().min_by(|a, b| {
+    let most = map.nodes.samples_mm().map(|[_, _, e]| e).fold(0.0, f64::max);
+    assert!(map.nodes.values_mm.iter().all(|v| v.abs() <= most + 4.0 / 27.0 * 1e-4 * level_off_mm + 1e-12));
+    let [x, y] = map.nodes.grid.place_mm(corner);
+    let near = map.nodes.samples_mm().min_by(|a, b| {
         let d = |s: &[f64; 3]| (s[0] - x).hypot(s[1] - y);
         d(a).total_cmp(&d(b))
     });
-    assert!((map.values_mm[corner] - near.unwrap()[2]).abs() < 1e-12);
+    assert!((map.nodes.values_mm[corner] - near.unwrap()[2]).abs() < 1e-12);
     // Everything valid lies where something was measured, or within a node of it.
-    assert!(map.samples_mm().iter().all(|[x, y, _]| x.hypot(*y) < 41.5));
+    assert!(map.nodes.samples_mm().all(|[x, y, _]| x.hypot(y) < 41.5));
 }
 
 #[test]
@@ -438,32 +442,27 @@ fn filter_grid_matches_readings() {
     let grid = Grid { columns: 81, rows: 61, first_mm: [-20.0, -15.0], spacing_mm: [0.5, 0.5] };
     let valid: Vec<bool> = (0..grid.len()).map(|k| grid.place_mm(k)).map(|[x, y]| x.hypot(y) > 6.0).collect();
     let mut rng = StdRng::seed_from_u64(9);
-    let values: Vec<f64> = (0..grid.len())
+    let values_mm: Vec<f64> = (0..grid.len())
         .map(|k| grid.place_mm(k))
         .zip(&valid)
         .map(|([x, y], v)| if *v { form(x, y) + 3e-4 * normal(&mut rng) } else { f64::INFINITY })
         .collect();
-    let plain_form = filter_grid(&grid, &values, &valid, 5.0, FilterOrder::Plane, false).unwrap();
-    let readings: Vec<DeviationSample> = (0..grid.len())
-        .filter(|&k| valid[k])
-        .map(|k| DeviationSample { place_mm: grid.place_mm(k), deviation_mm: values[k] })
-        .collect();
+    let map = GridMap { grid, values_mm, valid };
+    let plain_form = filter_grid(&map, 5.0, FilterOrder::Plane, false).unwrap().nodes;
+    let reading = |[x, y, deviation_mm]: [f64; 3]| DeviationSample { place_mm: [x, y], deviation_mm };
+    let readings: Vec<DeviationSample> = map.samples_mm().map(reading).collect();
     let exact = direct(&readings, &grid, 5.0);
-    let nodes = || (0..grid.len()).filter(|&k| plain_form.valid[k]);
-    assert!(nodes().count() > grid.len() * 8 / 10);
-    let most = nodes().map(|k| (plain_form.values[k] - exact[k]).abs()).fold(0.0, f64::max);
+    assert!(plain_form.valid_count() > grid.len() * 8 / 10);
+    let most = plain_form.valid_values_mm().map(|(k, value)| (value - exact[k]).abs()).fold(0.0, f64::max);
     assert!(most < 1e-8, "{most}");
-    let robust_form = filter_grid(&grid, &values, &valid, 5.0, FilterOrder::Plane, true).unwrap();
+    let robust_form = filter_grid(&map, 5.0, FilterOrder::Plane, true).unwrap();
     assert!(robust_form.rounds > 1);
-    assert!(rms(nodes().map(|k| robust_form.values[k] - exact[k])) < 1e-4);
-    assert!(matches!(
-        filter_grid(&grid, &values[1..], &valid, 5.0, FilterOrder::Plane, true),
-        Err(MapError::Shape { .. })
-    ));
-    assert!(matches!(
-        filter_grid(&grid, &values, &vec![true; grid.len()], 5.0, FilterOrder::Plane, true),
-        Err(MapError::NotFinite { .. })
-    ));
+    let apart = |(k, _): (usize, f64)| robust_form.nodes.values_mm[k] - exact[k];
+    assert!(rms(plain_form.valid_values_mm().map(apart)) < 1e-4);
+    let refused = |map: &GridMap| filter_grid(map, 5.0, FilterOrder::Plane, true).unwrap_err();
+    let short = GridMap { values_mm: map.values_mm[1..].to_vec(), ..map.clone() };
+    assert!(matches!(refused(&short), MapError::Shape { .. }));
+    assert!(matches!(refused(&GridMap::all_valid(grid, map.values_mm)), MapError::NotFinite { .. }));
 }
 
 #[test]
@@ -513,7 +512,7 @@ fn map_scales_with_values() {
             let scaled: Vec<DeviationSample> =
                 unit.iter().map(|r| DeviationSample { deviation_mm: factor * r.deviation_mm, ..*r }).collect();
             let other = fitted_map(&scaled, &options);
-            let apart = other.values_mm.iter().zip(&map.values_mm).map(|(o, m)| (o - factor * m).abs());
+            let apart = other.nodes.values_mm.iter().zip(&map.nodes.values_mm).map(|(o, m)| (o - factor * m).abs());
             assert!(apart.fold(0.0, f64::max) <= 1e-14 * factor, "{smoothing:?} {factor}");
         }
     }
@@ -540,9 +539,9 @@ fn model_map_carries_point_sigma() {
     let options = MapOptions::new(5.0, 1.0);
     let map = map_from_model(&told, &options, 2e-4).unwrap();
     let alone = fitted_map(&trial(form), &MapOptions { outlier_limit: None, ..options });
-    assert_eq!((map.values_mm, map.point_sigma_mm), (alone.values_mm, 2e-4));
-    for (k, found) in map.sigma_mm.iter().enumerate().filter(|(k, _)| map.valid[*k]) {
-        let [x, y] = map.grid.place_mm(k);
+    assert_eq!((map.nodes.values_mm, map.point_sigma_mm), (alone.nodes.values_mm, 2e-4));
+    for (k, found) in map.sigma_mm.iter().enumerate().filter(|(k, _)| map.nodes.valid[*k]) {
+        let [x, y] = map.nodes.grid.place_mm(k);
         assert!((found - sigma(x, y)).abs() < 1e-6, "{found} at {x}, {y}");
     }
     // Known everywhere but at one place: never better than anywhere, never worse than there.

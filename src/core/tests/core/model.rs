@@ -10,12 +10,11 @@ use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose}
 use crate::sample::seeds;
 use regrind_core::form::{IsoFits, IsoFormValues, SlopeOperator};
 use regrind_core::geometry::Pose;
-use regrind_core::model::{
-    AngleInterval, BudgetEntry, Form, FormFigures, Interval, MachineUncertainty, ModelInputs, UncertaintySource,
-};
+use regrind_core::model::{AngleInterval, BudgetEntry, Form, MachineUncertainty, ModelInputs, UncertaintySource};
 use regrind_core::registration::{
     Coordinate, Deviation, PointStatus, Registration, RegistrationOptions, Start, register,
 };
+use regrind_figures::{FormFigures, Interval};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
 use regrind_sim::shape::{FreeForm, Shape};
@@ -591,7 +590,7 @@ fn form_without_free_motions() {
                 let places: Vec<_> = registration.deviations.iter().map(|d| (d.point, d.normal)).collect();
                 let at_places = Form::estimate_at(&registration, &ModelInputs::default(), &places).unwrap();
                 let figures = [form.figures, at_places.figures];
-                for of in figures.iter().flat_map(|FormFigures { rms, pv, pv_998 }| [rms, pv, pv_998]) {
+                for of in figures.iter().flat_map(|FormFigures { rms, pv, pv_998, .. }| [rms, pv, pv_998]) {
                     assert!(0.0 <= of.low_mm && of.low_mm <= of.median_mm && of.median_mm <= of.high_mm, "{of:?}");
                     assert!(!is_zero || of.high_mm < 1e-12, "{of:?}");
                 }
@@ -616,7 +615,7 @@ fn figures_independent_of_threads() {
         pool.install(|| Form::estimate(&found, &ModelInputs::default()).unwrap())
     };
     let bits = |form: &Form| {
-        let FormFigures { rms, pv, pv_998: pv_most_points } = form.figures;
+        let FormFigures { rms, pv, pv_998: pv_most_points, .. } = form.figures;
         [rms, pv, pv_most_points].map(|of| [of.low_mm, of.median_mm, of.high_mm].map(f64::to_bits))
     };
     let [one, three] = [1, 3].map(|threads| bits(&on(threads)));

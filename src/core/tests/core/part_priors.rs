@@ -8,9 +8,10 @@ use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
 use crate::sample::seeds;
 use regrind_core::geometry::{Point, Vector};
 use regrind_core::model::{
-    Field, Form, Hyperparameters, Interval, ModelInputs, Observations, PartFit, PartPriors, Prior, farthest_points,
+    Field, Form, Hyperparameters, ModelInputs, Observations, PartFit, PartPriors, Prior, farthest_points,
 };
 use regrind_core::registration::{Registration, RegistrationOptions, Start, register};
+use regrind_figures::Interval;
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
 use regrind_sim::shape::{FreeForm, Shape};

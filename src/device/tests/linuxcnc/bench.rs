@@ -4,10 +4,11 @@ use std::fs;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use data_encoding::HEXLOWER;
 use regrind_core::geometry::Grid;
 use regrind_device::{
     Armed, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, LinuxcncGrinder, LinuxcncSettings, Machine,
-    MachineState, Pass, Status, digest, hex,
+    MachineState, Pass, Status, digest,
 };
 use tempfile::TempDir;
 
@@ -37,7 +38,10 @@ pub fn map() -> CorrectionMap {
 
 /// A program of the map that does this, with the path mode first.
 pub fn program(body: &str) -> String {
-    format!("(map: sha256 {})\nG21 G90 G94 G17 G40 G49 G80 G54\nG64 P0.0001 Q0\n{body}M2\n", hex(&map().identity()))
+    format!(
+        "(map: sha256 {})\nG21 G90 G94 G17 G40 G49 G80 G54\nG64 P0.0001 Q0\n{body}M2\n",
+        HEXLOWER.encode(&map().identity())
+    )
 }
 
 /// A program that goes to and fro for so many lines.

@@ -77,22 +77,29 @@ fn x3p_data_types_and_nan() {
     let singles: Vec<u8> = steps.iter().flat_map(|v| (f32::from(*v) * 0.25).to_le_bytes()).collect();
     for (kind, increment, data) in [("I", 1e-3, &shorts), ("L", 1e-3, &longs)] {
         let map = map(parsed(&main_xml(kind, increment, ""), data));
-        assert!(map.heights_mm.iter().zip(&heights).all(|(a, b)| is_about(*a, *b)), "{kind}: {:?}", map.heights_mm);
-        assert_eq!((map.grid.spacing_mm, map.grid.first_mm, map.measured_count()), ([1.0, 1.0], [0.0, 0.0], 6));
+        assert!(
+            map.heights.values_mm.iter().zip(&heights).all(|(a, b)| is_about(*a, *b)),
+            "{kind}: {:?}",
+            map.heights.values_mm
+        );
+        assert_eq!(
+            (map.heights.grid.spacing_mm, map.heights.grid.first_mm, map.measured_count()),
+            ([1.0, 1.0], [0.0, 0.0], 6)
+        );
     }
-    assert_eq!(map(parsed(&main_xml("F", 1.0, ""), &singles)).heights_mm[5], 1750.0);
+    assert_eq!(map(parsed(&main_xml("F", 1.0, ""), &singles)).heights.values_mm[5], 1750.0);
     let bad = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 0.25, 0.0, 1.0];
     let doubles: Vec<u8> = bad.iter().flat_map(|v| v.to_le_bytes()).collect();
     let read = map(parsed(&main_xml("D", 1.0, ""), &doubles));
-    assert_eq!(read.valid, [false, false, false, true, true, true]);
-    assert_eq!(read.heights_mm, [0.0, 0.0, 0.0, 750.0, 500.0, 1500.0]);
+    assert_eq!(read.heights.valid, [false, false, false, true, true, true]);
+    assert_eq!(read.heights.values_mm, [0.0, 0.0, 0.0, 750.0, 500.0, 1500.0]);
     // The mask says more: bits from the least significant one.
     let mask = "<ValidPointsLink>./bindata/valid.bin</ValidPointsLink>";
     let xml = main_xml("D", 1.0, mask);
     let entries =
         [("main.xml", xml.as_bytes()), ("bindata/data.bin", &doubles), ("bindata/valid.bin", &[0b0010_1111][..])];
     let read = map(parse_x3p(Path::new("m"), &container(&entries)));
-    assert_eq!(read.valid, [false, false, false, true, false, true]);
+    assert_eq!(read.heights.valid, [false, false, false, true, false, true]);
 }
 
 #[test]
@@ -165,7 +172,7 @@ fn x3p_refuses_unsupported_content() {
     let new =
         xml.replace("ISO5436 \u{2013} 2000", "ISO25178-72:2017/DAM1:2020").replace("<Increment>1<", "<Increment>1e-6<");
     let ones: Vec<u8> = 1e3f64.to_le_bytes().repeat(6);
-    assert!(is_about(map(parsed(&new, &ones)).heights_mm[0], 501.0));
+    assert!(is_about(map(parsed(&new, &ones)).heights.values_mm[0], 501.0));
 }
 
 #[test]
@@ -198,19 +205,19 @@ fn x3p_write_round_trip() {
     }
     assert_eq!(fs::read(&path).unwrap(), fs::read(&again).unwrap());
     let X3pFile::Map(read) = read_x3p(&path).unwrap() else { panic!("a map") };
-    assert_eq!((read.grid.columns, read.grid.rows, &read.valid), (7, 5, &written.valid));
-    assert!((0..2).all(|k| is_about(read.grid.first_mm[k], written.grid.first_mm[k])));
-    assert!((0..2).all(|k| is_about(read.grid.spacing_mm[k], written.grid.spacing_mm[k])));
-    for (k, valid) in read.valid.iter().enumerate() {
-        let expected = if *valid { written.values_mm[k] } else { 0.0 };
-        assert!(is_about(read.heights_mm[k], expected), "{k}");
+    assert_eq!((read.heights.grid.columns, read.heights.grid.rows, &read.heights.valid), (7, 5, &written.nodes.valid));
+    assert!((0..2).all(|k| is_about(read.heights.grid.first_mm[k], written.nodes.grid.first_mm[k])));
+    assert!((0..2).all(|k| is_about(read.heights.grid.spacing_mm[k], written.nodes.grid.spacing_mm[k])));
+    for (k, valid) in read.heights.valid.iter().enumerate() {
+        let expected = if *valid { written.nodes.values_mm[k] } else { 0.0 };
+        assert!(is_about(read.heights.values_mm[k], expected), "{k}");
     }
     let mut zip = zip::ZipArchive::new(fs::File::open(&path).unwrap()).unwrap();
     let xml = std::io::read_to_string(zip.by_name("main.xml").unwrap()).unwrap();
     assert!(xml.contains("<Comment>SIMULATION") && xml.contains("<Date>2026-03-01T12:00:00Z<"));
     assert_eq!(fs::read_dir(home.path()).unwrap().count(), 2, "no draft is left");
     let mut broken = written.clone();
-    broken.values_mm[0] = f64::NAN;
+    broken.nodes.values_mm[0] = f64::NAN;
     assert!(write_error_map_x3p(&home.path().join("no.x3p"), &broken, "", false).is_err());
     assert!(!home.path().join("no.x3p").exists());
 }
@@ -240,9 +247,9 @@ const SDF: &str = "aISO-1.0\r\nManufacID = x\r\nCreateDate = 010120260000\r\nNum
 #[test]
 fn sdf_text_read_and_errors() {
     let read = parse_sdf(Path::new("s"), SDF.as_bytes()).unwrap();
-    assert_eq!((read.grid.columns, read.grid.rows, read.grid.spacing_mm), (3, 2, [1.0, 2.0]));
-    assert_eq!((read.valid[2], read.measured_count()), (false, 5));
-    assert!(is_about(read.heights_mm[1], 2.5e-3) && is_about(read.heights_mm[5], 0.06));
+    assert_eq!((read.heights.grid.columns, read.heights.grid.rows, read.heights.grid.spacing_mm), (3, 2, [1.0, 2.0]));
+    assert_eq!((read.heights.valid[2], read.measured_count()), (false, 5));
+    assert!(is_about(read.heights.values_mm[1], 2.5e-3) && is_about(read.heights.values_mm[5], 0.06));
     let cases: &[(&str, &str, &[&str])] = &[
         ("NumPoints = 3", "NumPoints = 4", &["expected 8 heights"]),
         ("NumPoints = 3", "NumPoints = 2", &["found `more`"]),
@@ -301,11 +308,11 @@ fn sdf_binary_data_types() {
     for (kind, heights, measured) in cases {
         for extra in [&[][..], &[5, 0, 0, 0, 1, 0, 0, 0]] {
             let read = parse_sdf(Path::new("s"), &binary_sdf(kind, &heights, extra)).unwrap();
-            assert_eq!((read.measured_count(), read.grid.spacing_mm), (measured, [1.0, 2.0]), "type {kind}");
+            assert_eq!((read.measured_count(), read.heights.grid.spacing_mm), (measured, [1.0, 2.0]), "type {kind}");
             assert!(
-                (0..5).all(|k| is_about(read.heights_mm[k], 1e-3 * k as f64)),
+                (0..5).all(|k| is_about(read.heights.values_mm[k], 1e-3 * k as f64)),
                 "type {kind}: {:?}",
-                read.heights_mm
+                read.heights.values_mm
             );
         }
         let cut = parse_sdf(Path::new("s"), &binary_sdf(kind, &heights[..heights.len() - 1], &[]));
@@ -332,10 +339,10 @@ fn metropro() -> Vec<u8> {
 fn metropro_read_and_errors() {
     let good = metropro();
     let read = parse_metropro(Path::new("z"), &good).unwrap();
-    assert_eq!((read.valid.clone(), read.grid.first_mm), (vec![true, true, true, false], [0.0; 2]));
+    assert_eq!((read.heights.valid.clone(), read.heights.grid.first_mm), (vec![true, true, true, false], [0.0; 2]));
     // Half a wave of 625 nm is 32768 steps; the lower row comes last in the file.
     let wave_mm = f64::from(6.25e-7f32) * 1e3;
-    for (found, waves) in read.heights_mm.iter().zip([-0.5, 1.0, 0.5 / 32768.0, 0.0]) {
+    for (found, waves) in read.heights.values_mm.iter().zip([-0.5, 1.0, 0.5 / 32768.0, 0.0]) {
         assert!(is_about(*found, waves * wave_mm), "{found}");
     }
     for (at, with, expected) in [

@@ -34,12 +34,20 @@ fn real_x3p_maps_are_read() {
     let folder = data("x3p-sdf-samples");
     for (file, size, spacing_mm, samples, (column, row, height), range_mm) in KNOWN {
         let X3pFile::Map(map) = read_x3p(folder.join(file)).unwrap() else { panic!("{file} is a map") };
-        assert_eq!(([map.grid.columns, map.grid.rows], map.measured_count()), (size, samples), "{file}");
-        assert!((0..2).all(|k| is_about(map.grid.spacing_mm[k], spacing_mm[k])), "{file}: {:?}", map.grid.spacing_mm);
+        assert_eq!(
+            ([map.heights.grid.columns, map.heights.grid.rows], map.measured_count()),
+            (size, samples),
+            "{file}"
+        );
+        assert!(
+            (0..2).all(|k| is_about(map.heights.grid.spacing_mm[k], spacing_mm[k])),
+            "{file}: {:?}",
+            map.heights.grid.spacing_mm
+        );
         let measured = map.points();
         let (low, high) = measured.iter().fold((f64::MAX, f64::MIN), |(l, h), p| (l.min(p.z), h.max(p.z)));
         assert!(is_about(low, range_mm[0]) && is_about(high, range_mm[1]), "{file}: {low} {high}");
-        let found = map.heights_mm[row * map.grid.columns + column];
+        let found = map.heights.values_mm[row * map.heights.grid.columns + column];
         assert!(height.is_nan() || (found / height - 1.0).abs() < 1e-8, "{file}: {found}");
         assert_eq!(read_measured(folder.join(file)).unwrap(), measured);
         assert_eq!(map.notes.is_empty(), !file.contains("sample-land"), "{file}: {:?}", map.notes);
@@ -83,13 +91,21 @@ fn real_zygo_maps_match_published() {
     ] {
         let map = read_metropro(folder.join(file)).unwrap();
         let [pv, rms] = [1e6 * map.pv_mm(), 1e6 * map.rms_mm()];
-        println!("{file}: PV {pv:.3} nm, RMS {rms:.4} nm, {} of {} measured", map.measured_count(), map.valid.len());
-        assert_eq!(([map.grid.columns, map.grid.rows], map.measured_count()), (size, measured), "{file}");
+        println!(
+            "{file}: PV {pv:.3} nm, RMS {rms:.4} nm, {} of {} measured",
+            map.measured_count(),
+            map.heights.valid.len()
+        );
+        assert_eq!(
+            ([map.heights.grid.columns, map.heights.grid.rows], map.measured_count()),
+            (size, measured),
+            "{file}"
+        );
         assert!((pv - pv_nm).abs() < 5e-3 && (rms - rms_nm).abs() < 5e-4, "{file}: {pv} {rms}");
         assert!(
-            map.grid.spacing_mm.iter().all(|spacing| is_about(*spacing, pitch_mm)),
+            map.heights.grid.spacing_mm.iter().all(|spacing| is_about(*spacing, pitch_mm)),
             "{file}: {:?}",
-            map.grid.spacing_mm
+            map.heights.grid.spacing_mm
         );
         assert_eq!(read_measured(folder.join(file)).unwrap().len(), measured);
     }
@@ -101,10 +117,10 @@ fn real_sdf_softgauge_is_read() {
     let folder = data("x3p-sdf-samples");
     for file in ["surfacetopography/sdf-1.sdf", "surfalize/test_ascii.sdf"] {
         let map = read_sdf(folder.join(file)).unwrap();
-        assert_eq!(([map.grid.columns, map.grid.rows], map.measured_count()), ([7, 4], 28), "{file}");
-        assert!(map.grid.spacing_mm.iter().all(|spacing| is_about(*spacing, 1e-3)));
+        assert_eq!(([map.heights.grid.columns, map.heights.grid.rows], map.measured_count()), ([7, 4], 28), "{file}");
+        assert!(map.heights.grid.spacing_mm.iter().all(|spacing| is_about(*spacing, 1e-3)));
         for (k, height) in [(0, 1e-3), (12, 0.96736e-3), (27, 0.97986e-3)] {
-            assert!(is_about(map.heights_mm[k], height), "{file}: {}", map.heights_mm[k]);
+            assert!(is_about(map.heights.values_mm[k], height), "{file}: {}", map.heights.values_mm[k]);
         }
     }
     // Gridded points as text are points like any others; the one that is NaN is refused.

@@ -1,10 +1,12 @@
-//! Figure as it is recorded: its credible interval after a measurement, and the probability that it is within a limit.
+//! Credible interval of a figure, and the probability that the figure is within a limit.
 
 use serde::{Deserialize, Serialize};
 
-/// Credible interval of a figure after a measurement, as it is recorded.
+use super::normal;
+
+/// Median and 95 % credible interval of a figure after a measurement.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct RecordedInterval {
+pub struct Interval {
     /// Median.
     #[serde(with = "super::number")]
     pub median_mm: f64,
@@ -14,13 +16,13 @@ pub struct RecordedInterval {
     /// Quantile at 97.5 %.
     #[serde(with = "super::number")]
     pub high_mm: f64,
-    /// Quantiles at [`RecordedInterval::PROBABILITIES`]. `None` if the figure is treated as normal, and in records of
-    /// earlier versions.
+    /// Quantiles at [`Interval::PROBABILITIES`]. `None` if the figure is treated as normal, if only the interval is
+    /// needed, and in records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub quantiles_mm: Option<[f64; RecordedInterval::COUNT]>,
+    pub quantiles_mm: Option<[f64; Interval::COUNT]>,
 }
 
-impl RecordedInterval {
+impl Interval {
     /// Number of quantiles of a figure.
     pub const COUNT: usize = 15;
     /// Probabilities of the quantiles. They are dense near the usual required probabilities, and end at 0.001 and
@@ -59,6 +61,13 @@ impl RecordedInterval {
         0.5 * (self.high_mm - self.low_mm)
     }
 
+    /// Returns the standard uncertainty in mm: the width of the 95 % interval divided by 3.92. The 95 % interval of a
+    /// normal distribution is 3.92 standard deviations wide.
+    pub fn standard_uncertainty_mm(&self) -> f64 {
+        const WIDTH: f64 = 2.0 * 1.96;
+        (self.high_mm - self.low_mm) / WIDTH
+    }
+
     /// Returns the probability that the figure is at most `limit_mm`. The result is clamped to 0.001 to 0.999, because
     /// the quantiles beyond these probabilities are unknown.
     pub fn probability_within(&self, limit_mm: f64) -> f64 {
@@ -73,7 +82,7 @@ impl RecordedInterval {
         if share == 0.0 {
             return Self::PROBABILITIES[below];
         }
-        normal_probability(Self::DEVIATES[below] + share * (Self::DEVIATES[below + 1] - Self::DEVIATES[below]))
+        normal::probability(Self::DEVIATES[below] + share * (Self::DEVIATES[below + 1] - Self::DEVIATES[below]))
     }
 
     /// Returns the quantile of the figure at `probability` (0 to 1), in mm. A probability below 0.001 counts as 0.001,
@@ -90,7 +99,7 @@ impl RecordedInterval {
         if next == 0 || Self::PROBABILITIES[next] <= probability + SAME {
             return quantiles[next];
         }
-        let deviate = normal_deviate(probability);
+        let deviate = normal::deviate(probability);
         let share = (deviate - Self::DEVIATES[next - 1]) / (Self::DEVIATES[next] - Self::DEVIATES[next - 1]);
         quantiles[next - 1] + share * (quantiles[next] - quantiles[next - 1])
     }
@@ -115,32 +124,12 @@ impl RecordedInterval {
         quantiles_mm.unwrap_or_else(|| std::array::from_fn(of_normal))
     }
 
-    pub(super) fn is_valid(&self) -> bool {
+    /// Returns true if all values are finite and in ascending order, and the median is not negative.
+    pub fn is_valid(&self) -> bool {
         let Self { median_mm, low_mm, high_mm, quantiles_mm } = *self;
         let ascend = |all: &[f64]| all.iter().all(|v| v.is_finite()) && all.is_sorted();
         ascend(&[low_mm, median_mm, high_mm]) && median_mm >= 0.0 && quantiles_mm.is_none_or(|all| ascend(&all))
     }
-}
-
-/// Returns the probability that a standard normal variable is at most `deviate` (Abramowitz and Stegun 26.2.17,
-/// accurate to 1e-7).
-fn normal_probability(deviate: f64) -> f64 {
-    const FACTORS: [f64; 5] = [0.319_381_530, -0.356_563_782, 1.781_477_937, -1.821_255_978, 1.330_274_429];
-    let t = 1.0 / (1.0 + 0.231_641_9 * deviate.abs());
-    let series = FACTORS.iter().rev().fold(0.0, |sum, factor| t * (factor + sum));
-    let above = series * (-0.5 * deviate * deviate).exp() / std::f64::consts::TAU.sqrt();
-    if deviate < 0.0 { above } else { 1.0 - above }
-}
-
-/// Returns the quantile of the standard normal distribution at `probability`, which must be from 0.001 to 0.999. The
-/// quantile is found by bisection of the distribution function.
-fn normal_deviate(probability: f64) -> f64 {
-    let (mut low, mut high) = (-4.0, 4.0);
-    for _ in 0..60 {
-        let middle = 0.5 * (low + high);
-        if normal_probability(middle) < probability { low = middle } else { high = middle }
-    }
-    0.5 * (low + high)
 }
 
 #[cfg(test)]
@@ -149,16 +138,16 @@ mod tests {
 
     #[test]
     fn interval_deviates_match_probabilities() {
-        for (p, z) in RecordedInterval::PROBABILITIES.iter().zip(RecordedInterval::DEVIATES) {
-            assert!((normal_probability(z) - p).abs() < 1e-7, "{z} {p}");
-            assert!((normal_deviate(*p) - z).abs() < 1e-4, "{z} {p}");
+        for (p, z) in Interval::PROBABILITIES.iter().zip(Interval::DEVIATES) {
+            assert!((normal::probability(z) - p).abs() < 1e-7, "{z} {p}");
+            assert!((normal::deviate(*p) - z).abs() < 1e-4, "{z} {p}");
         }
     }
 
     #[test]
     fn probability_within_normal_interval() {
         // u = 1, so the expanded uncertainty is 1.96.
-        let of = RecordedInterval::from_expanded(10.0, 1.959_963_984_540_054_2);
+        let of = Interval::from_expanded(10.0, 1.959_963_984_540_054_2);
         for (limit, probability) in [(10.0, 0.5), (11.0, 0.841_344_7), (12.0, 0.977_249_9), (8.5, 0.066_807_2)] {
             assert!((of.probability_within(limit) - probability).abs() < 1e-6, "{limit}");
         }
@@ -171,7 +160,7 @@ mod tests {
 
     #[test]
     fn probability_within_zero_uncertainty() {
-        let of = RecordedInterval::from_expanded(5.0, 0.0);
+        let of = Interval::from_expanded(5.0, 0.0);
         assert_eq!([4.9, 5.0, 5.1].map(|limit| of.probability_within(limit)), [0.001, 0.999, 0.999]);
         assert_eq!(of.quantile_mm(0.6), 5.0);
     }
@@ -179,13 +168,13 @@ mod tests {
     #[test]
     fn probability_within_recorded_quantiles() {
         // Only an upper bound is known: all quantiles below the median are 0.
-        let quantiles: [f64; RecordedInterval::COUNT] = std::array::from_fn(|k| if k < 7 { 0.0 } else { k as f64 });
-        let of = RecordedInterval { quantiles_mm: Some(quantiles), median_mm: 7.0, low_mm: 0.0, high_mm: 11.0 };
+        let quantiles: [f64; Interval::COUNT] = std::array::from_fn(|k| if k < 7 { 0.0 } else { k as f64 });
+        let of = Interval { quantiles_mm: Some(quantiles), median_mm: 7.0, low_mm: 0.0, high_mm: 11.0 };
         assert!(of.is_valid());
         assert_eq!([8.0, 11.0, 12.0, 14.0].map(|limit| of.probability_within(limit)), [0.75, 0.975, 0.99, 0.999]);
         assert!((0.9..0.95).contains(&of.probability_within(9.5)));
         assert!(of.quantile_mm(1.0 - 0.995) == 0.0 && of.quantile_mm(0.93) > 9.0);
-        let broken = RecordedInterval { quantiles_mm: Some(quantiles.map(|q| -q)), ..of };
+        let broken = Interval { quantiles_mm: Some(quantiles.map(|q| -q)), ..of };
         assert!(!broken.is_valid());
     }
 }
