@@ -8,22 +8,13 @@
 //! machine. With the plant file of a cell, every second round runs while `regrind ship` replicates the record and, if
 //! the file names a broker, `regrind tell` publishes live values. The times of the other rounds are printed next to it.
 
-#[path = "../tests/common/keep.rs"]
-mod keep;
-#[path = "../tests/common/rig.rs"]
-mod rig;
-#[path = "../tests/common/tries.rs"]
-mod tries;
-#[path = "../tests/common/wire_faults.rs"]
-mod wire_faults;
-
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use rig::Rig;
-use tries::{MOMENTS, attempt};
+use regrind_testcell::rig::{self, Rig};
+use regrind_testcell::tries::{MOMENTS, attempt};
 
 fn main() {
     // Cargo adds options of its own.

@@ -9,19 +9,12 @@
 //! Only the communication with the machines is left out. WAY selects the lines whose names begin with it. The figure is
 //! written to `target/convergence/convergence.svg`.
 
-#[path = "../tests/common/payloads.rs"]
-mod client_payloads;
-#[path = "../tests/common/perfect.rs"]
-mod perfect;
-#[path = "../tests/run/study.rs"]
-mod study;
-
 use std::fs;
 
 use rayon::prelude::*;
 use regrind::compensation::GainRule;
 use regrind::report::{Axis, Plot, Scale, Series};
-use study::{After, Bench, RECIPES, Way};
+use regrind_testcell::study::{After, Bench, RECIPES, Way};
 
 fn main() {
     let number = |k: usize, otherwise: u64| std::env::args().nth(k).map_or(otherwise, |n| n.parse().expect("a number"));

@@ -5,20 +5,13 @@
 //! cargo run --release --example parameters [WORLDS [FIRST [RECIPE]]]
 //! ```
 //! The program runs WORLDS (200) worlds from seed FIRST (1) on, of RECIPE (freeform-mirror). Wheel, setting and part
-//! have the errors that `tests/run/identifiability.rs` states. There are three registrations: free, with x, y and z locked,
-//! and with the tilts locked. Every part is made twice from the same blank on the same machines: with parameters, and
-//! by the map alone.
-
-#[path = "../tests/common/payloads.rs"]
-mod client_payloads;
-#[path = "../tests/common/perfect.rs"]
-mod perfect;
-#[path = "../tests/run/study.rs"]
-mod study;
+//! have the errors that `tests/testcell/study/identifiability.rs` states. There are three registrations: free, with x, y
+//! and z locked, and with the tilts locked. Every part is made twice from the same blank on the same machines: with
+//! parameters, and by the map alone.
 
 use rayon::prelude::*;
-use study::identifiability::{Compared, Machine, ParameterResult, corrections};
-use study::{After, Bench};
+use regrind_testcell::study::identifiability::{Compared, ParameterResult, corrections};
+use regrind_testcell::study::{After, Bench, Machine};
 
 const PASSES: u16 = 4;
 

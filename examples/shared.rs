@@ -8,16 +8,9 @@
 //! each recipe that ships with a truth. Both machines have experience with one other recipe, the next of the list. The
 //! first machine has made PARTS (2) of the recipe. DIFFER selects the lines whose names begin with it.
 
-#[path = "../tests/common/payloads.rs"]
-mod client_payloads;
-#[path = "../tests/common/perfect.rs"]
-mod perfect;
-#[path = "../tests/run/study.rs"]
-mod study;
-
 use rayon::prelude::*;
-use study::transfer::{Differ, Pair, TAUGHT_BY, TransferResult};
-use study::{After, Bench, RECIPES};
+use regrind_testcell::study::transfer::{Differ, Pair, TAUGHT_BY, TransferResult};
+use regrind_testcell::study::{After, Bench, RECIPES};
 
 /// Maximum ratio of the first pass to the floor.
 const MAX: f64 = 1.3;

@@ -6,16 +6,9 @@
 //! The program runs WORLDS (50) worlds for each recipe that ships with one, from seed FIRST (1) on, with limits that
 //! are LIMITS (1.0) times those of the recipe. Every part is made twice, from the same blank on the same machines.
 
-#[path = "../tests/common/payloads.rs"]
-mod client_payloads;
-#[path = "../tests/common/perfect.rs"]
-mod perfect;
-#[path = "../tests/run/study.rs"]
-mod study;
-
 use rayon::prelude::*;
-use study::made_part::{Made, Measured};
-use study::{Bench, RECIPES};
+use regrind_testcell::study::made_part::{Made, Measured};
+use regrind_testcell::study::{Bench, RECIPES};
 
 fn main() {
     let number = |k: usize, otherwise: u64| std::env::args().nth(k).map_or(otherwise, |n| n.parse().expect("a number"));

@@ -13,10 +13,10 @@
 //!  truth      state that the two machines share, and the source of every random number
 //!  world      the two machines, and queries for tests
 //!  part       the part as it really is, and exact contact with it
-//!  removal    the surface that a pass leaves at a node, for every grinder; its sources of motion are:
-//!  grinder      strokes of a pass over a map, or over a program that the grinder reads
-//!  followed_surface  the heights of that program
-//!  executed_wheel    the path that a controller executes
+//!  removal    the surface that a pass leaves at a node, for every grinder; the three below are its sources of motion
+//!  grinder    strokes of a pass over a map
+//!  followed_surface   the same strokes, over a program that the grinder reads
+//!  executed_wheel     the path of the wheel that a controller executes
 //!  program    reader of programs, as a control reads them
 //!  cmm        the measuring machine: its result of a plan
 //!  payload    the bytes of docs/modbus.md
@@ -28,14 +28,17 @@
 //!  options    options of a machine, with its register map
 //!  handshake  one machine's side of the handshake: states, interlocks, silence
 //!  registers  a whole machine: what a Modbus client reads and writes
-//!  line_server  what dme and rsh have in common for their wires
+//!  line_server        what dme and rsh have in common for their wires
 //!  dme        a server of I++ DME, commanded touch by touch
 //!  rsh        a LinuxCNC controller, commanded program by program
 //!  faults     faults of one of these three
 //!  hits       a machine that prints a line for each touch, and receives nothing
 //!  seen       events of the machine
-//!  wire       Modbus TCP and RTU and I++ DME servers, lines of hits, pseudo-terminals, the path of an external
-//!             controller, and the faults of all of them
+//!  wire       Modbus TCP and RTU, servers of lines, lines of hits, pseudo-terminals, the path of an external controller
+//!
+//!  simulators         the simulator of each protocol, one line each
+//!  simulated_cell     what a simulator is told of its machine, and what it serves
+//!  modbus             the simulator of Modbus; those of dme, rsh and hits are in their folders
 //! ```
 //!
 //! Units: millimetres and radians throughout. Frames: `shape` and `form` use the model frame; the points that a probe

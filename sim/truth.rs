@@ -34,8 +34,7 @@ pub struct GrindEntry {
     pub volume_mm3: f64,
 }
 
-/// Pass along a path that an external controller executed: from the first contact of wheel and part until the part was
-/// taken away.
+/// Pass along a path that a controller executed: from the first contact of wheel and part until the part was taken away.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ExecutedPass {
     /// Number of visits of the wheel to nodes, divided by the number of nodes: 1, plus 1 for every spark-out, if no

@@ -125,7 +125,7 @@ impl World {
     }
 
     /// Returns one entry for each pass of [`World::wheel`], in order of time. In these passes, the wheel follows the
-    /// path that an external controller executes. A running pass is included.
+    /// path that a controller executes. A running pass is included.
     pub fn executed_passes(&self) -> Vec<ExecutedPass> {
         locked(&self.state).executed_passes.clone()
     }

@@ -15,12 +15,9 @@ use regrind::formats::Learned;
 use regrind::geometry::Grid;
 use regrind::journal::{Entry, Header, Journal, RecordKind};
 use regrind_sim::payload;
+use regrind_testcell::payloads::Encode;
+use regrind_testparsers as parsers;
 use serde_json::json;
-
-#[path = "../fuzz/parsers.rs"]
-mod parsers;
-
-use parsers::payloads::Encode;
 
 #[global_allocator]
 static MEMORY: PeakAlloc = PeakAlloc;

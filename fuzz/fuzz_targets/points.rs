@@ -1,8 +1,5 @@
 #![no_main]
 
-#[path = "../parsers.rs"]
-mod parsers;
-
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    parsers::points(bytes);
+    regrind_testparsers::points(bytes);
 });

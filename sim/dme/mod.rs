@@ -1,5 +1,5 @@
 //! Server of I++ DME for a simulated measuring machine: its answer to each line, and the time of the answer. This
-//! module contains no wire; `wire/dme` has one.
+//! module contains no wire; `wire/lines` has one.
 //!
 //! ```text
 //!  line     parser of received commands, implemented independently

@@ -1,5 +1,5 @@
 //! LinuxCNC controller with linuxcncrsh: its answer to each line, and the program that it runs. This module contains no
-//! wire; `wire/rsh` has one.
+//! wire; `wire/lines` has one.
 //!
 //! ```text
 //!  program  a program as the interpreter reads it: ahead of the motion

@@ -21,9 +21,6 @@ mod parsers;
 mod plan;
 #[cfg(feature = "plant")]
 mod plant;
-#[cfg(not(feature = "plant"))]
-#[path = "plant/absent.rs"]
-mod plant;
 mod recover;
 mod register;
 mod report;
@@ -42,6 +39,8 @@ mod succession;
 mod terminal;
 mod users;
 mod watch;
+#[cfg(not(feature = "plant"))]
+mod without_plant;
 mod words;
 
 use std::io::{self, Write};
@@ -55,6 +54,8 @@ use regrind::document::{countable, visible};
 use regrind::drive::Request;
 use runtime::runtime;
 use terminal::{print, print_json};
+#[cfg(not(feature = "plant"))]
+use without_plant as plant;
 
 /// Closed-loop grinding: register measured probe centres to the offset of a nominal surface.
 #[derive(Debug, Parser)]

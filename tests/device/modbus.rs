@@ -21,7 +21,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket};
 
 use crate::toy::{Toy, pass};
-use crate::wire_faults::{Fault, FaultPlan, Request, Serving, SharedFaultPlan, When};
+use regrind_testcell::wire_faults::{Fault, FaultPlan, Request, Serving, SharedFaultPlan, When};
 
 // ---- machines to talk to ------------------------------------------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ use regrind_sim::{register_encoding, registers};
 
 use crate::modbus::{assert_exact, began, claimed, job_of, patient, plan, rtu, settings, wait_for_state};
 use crate::toy::Toy;
-use crate::wire_faults::{Fault, FaultPlan, Request, Serving, SharedFaultPlan, When};
+use regrind_testcell::wire_faults::{Fault, FaultPlan, Request, Serving, SharedFaultPlan, When};
 
 const HEADER: u16 = 400;
 const SELECT: u16 = 460;

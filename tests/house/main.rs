@@ -125,19 +125,25 @@ fn root() -> &'static Path {
 
 /// Returns the sources of a room, without the tests, benches and examples of its crate.
 fn sources(room: &str) -> Vec<Source> {
+    let files = rust_files(room, &["tests", "benches", "examples"]);
+    let read = |path: PathBuf| Source { code: code_of(&fs::read_to_string(&path).unwrap()), path };
+    files.into_iter().map(read).collect()
+}
+
+/// Returns the Rust files below a folder, except those in folders with these names.
+fn rust_files(folder: &str, left_out: &[&str]) -> Vec<PathBuf> {
     let mut found = Vec::new();
-    let mut open = vec![root().join(room)];
+    let mut open = vec![root().join(folder)];
     while let Some(path) = open.pop() {
-        if ["tests", "benches", "examples"].iter().any(|beside| path.ends_with(beside)) {
+        if left_out.iter().any(|name| path.ends_with(name)) {
             continue;
         } else if path.is_dir() {
             open.extend(fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path()));
         } else if path.extension().is_some_and(|e| e == "rs") {
-            let code = code_of(&fs::read_to_string(&path).unwrap());
-            found.push(Source { path, code });
+            found.push(path);
         }
     }
-    assert!(!found.is_empty(), "no room {room}");
+    assert!(!found.is_empty(), "no Rust file in {folder}");
     found
 }
 
@@ -248,11 +254,23 @@ fn core_cell_and_figures_are_pure() {
 
 /// Returns the crates that the manifest of one of our crates depends on, for every system or for one.
 fn dependencies(manifest: &str) -> Vec<String> {
+    names_in(manifest, "dependencies")
+}
+
+/// Returns the crates in one kind of list of a manifest, such as `dev-dependencies`, for every system or for one.
+fn names_in(manifest: &str, kind: &str) -> Vec<String> {
     let text = fs::read_to_string(root().join(manifest)).unwrap();
     let table: toml::Table = text.parse().unwrap();
     let systems = table.get("target").and_then(toml::Value::as_table).into_iter().flat_map(toml::Table::values);
-    let lists = table.get("dependencies").into_iter().chain(systems.filter_map(|system| system.get("dependencies")));
+    let lists = table.get(kind).into_iter().chain(systems.filter_map(|system| system.get(kind)));
     lists.flat_map(|list| list.as_table().unwrap().keys().cloned()).collect()
+}
+
+/// Returns the folders of the crates of this workspace.
+fn members() -> Vec<String> {
+    let workspace: toml::Table = fs::read_to_string(root().join("Cargo.toml")).unwrap().parse().unwrap();
+    let members = workspace["workspace"]["members"].as_array().unwrap().iter();
+    members.map(|member| member.as_str().unwrap().to_owned()).chain([".".to_owned()]).collect()
 }
 
 #[test]
@@ -301,6 +319,10 @@ fn crates_depend_downwards_only() {
             ],
         ),
         ("sim/Cargo.toml", &[]),
+        ("tests/testutils/Cargo.toml", &[]),
+        ("tests/testsim/Cargo.toml", &["regrind-sim"]),
+        ("tests/testcell/Cargo.toml", &["regrind", "regrind-sim", "regrind-testsim", "regrind-testutils"]),
+        ("tests/testparsers/Cargo.toml", &["regrind", "regrind-sim", "regrind-testcell", "regrind-testutils"]),
     ] {
         let ours: Vec<_> = dependencies(manifest).into_iter().filter(|name| name.starts_with("regrind")).collect();
         assert!(ours.iter().all(|name| may.contains(&name.as_str())), "{manifest}: {ours:?}");
@@ -317,15 +339,42 @@ fn unsafe_only_in_disk_and_windows() {
     const APART: [&str; 2] = ["src/journal/tests/disk", "src/windows"];
     let workspace: toml::Table = fs::read_to_string(root().join("Cargo.toml")).unwrap().parse().unwrap();
     assert_eq!(workspace["workspace"]["lints"]["rust"]["unsafe_code"].as_str(), Some("forbid"));
-    let members = workspace["workspace"]["members"].as_array().unwrap().iter().map(|member| member.as_str().unwrap());
-    for member in members.chain(["."]) {
+    for member in members() {
         let manifest = format!("{member}/Cargo.toml");
         let table: toml::Table = fs::read_to_string(root().join(&manifest)).unwrap().parse().unwrap();
         let inherits = table["lints"].get("workspace").and_then(toml::Value::as_bool) == Some(true);
-        assert_eq!(inherits, !APART.contains(&member), "{manifest} keeps the lints of the house");
+        assert_eq!(inherits, !APART.contains(&member.as_str()), "{manifest} keeps the lints of the house");
         assert!(!dependencies(&manifest).iter().any(|name| name == "regrind-disk"), "{manifest}");
         let everywhere = table.get("dependencies").is_some_and(|list| list.get("regrind-windows").is_some());
         assert!(!everywhere, "{manifest} needs regrind-windows on Windows alone");
+    }
+}
+
+/// The tests of a crate below the package `regrind` use only `regrind-testutils`, and those of `sim` also
+/// `regrind-testsim`: the other test crates would build all of `regrind` before them.
+#[test]
+fn test_crates_only_in_tests() {
+    for member in members() {
+        let manifest = format!("{member}/Cargo.toml");
+        let in_list = |kind| names_in(&manifest, kind).into_iter().filter(|name| name.starts_with("regrind-test"));
+        let is_for_tests = member.starts_with("tests/");
+        assert!(is_for_tests || in_list("dependencies").next().is_none(), "{manifest}: a program needs no test crate");
+        let is_low = |name: String| name == "regrind-testutils" || member == "sim" && name == "regrind-testsim";
+        let is_low = in_list("dev-dependencies").all(is_low);
+        assert!(is_low || member == ".", "{manifest} builds all of regrind for its tests");
+    }
+}
+
+/// A file is compiled in one crate. What several tests share is in a crate of its own, such as `tests/testutils`.
+#[test]
+fn only_twins_included_by_path() {
+    for folder in ["src", "sim", "tests", "benches", "examples", "fuzz/fuzz_targets"] {
+        for file in rust_files(folder, &[]) {
+            let is_twin = SYSTEMS.iter().any(|place| file.starts_with(root().join(place)));
+            let text = fs::read_to_string(&file).unwrap();
+            let line = text.lines().find(|line| line.trim_start().starts_with("#[path"));
+            assert!(is_twin || line.is_none(), "{}: {}", file.display(), line.unwrap_or_default());
+        }
     }
 }
 
@@ -381,7 +430,7 @@ fn functions_read_names_and_lines() {
 }
 
 /// Root files of the crates.
-const CRATES: [&str; 18] = [
+const CRATES: [&str; 22] = [
     "sim/lib.rs",
     "src/cell/lib.rs",
     "src/control/lib.rs",
@@ -400,6 +449,10 @@ const CRATES: [&str; 18] = [
     "src/report/lib.rs",
     "src/trust/lib.rs",
     "src/windows/lib.rs",
+    "tests/testcell/lib.rs",
+    "tests/testsim/lib.rs",
+    "tests/testparsers/lib.rs",
+    "tests/testutils/lib.rs",
 ];
 
 #[test]

@@ -1,8 +1,8 @@
 //! The page in a browser, as a person sees it.
 
+use regrind_testcell::browser::{Browser, Tab};
 use serde_json::json;
 
-use crate::browser::{Browser, Tab};
 use crate::program::{Running, changed, only_run, regrind, root, small_recipe};
 use crate::{CellPage, SPEED, serve_with, users};
 

@@ -4,13 +4,8 @@
 //! Tests that need a browser look for Debian package chromium. Signals and file modes are Unix only.
 #![cfg(unix)]
 
-#[path = "../common/keep.rs"]
-mod keep;
-#[path = "../common/program.rs"]
-mod program;
+regrind_testcell::program!();
 
-mod browser;
-mod http;
 mod in_a_browser;
 mod strangers;
 mod users;
@@ -18,8 +13,8 @@ mod views;
 
 use std::path::{Path, PathBuf};
 
-use http::Visitor;
 use program::{Running, regrind, small_recipe};
+use regrind_testcell::http::Visitor;
 
 /// Line of a recipe after which a test inserts the speed of its machines.
 const SPEED: &str = "[simulation]\nseed = 1";

@@ -4,9 +4,9 @@ use std::io::Write;
 use std::net::TcpStream;
 use std::path::Path;
 
+use regrind_testcell::http::{Visitor, raw};
 use serde_json::{Value, json};
 
-use crate::http::{Visitor, raw};
 use crate::program::{records_with, run};
 use crate::users::{PASSWORD, add};
 use crate::{CellPage, serve, serve_with};

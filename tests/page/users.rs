@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::sync::Arc;
 
+use regrind_testcell::http::{Visitor, raw_by_tls};
 use rustls::pki_types::CertificateDer;
 use rustls::{ClientConfig, RootCertStore};
 use serde_json::json;
 
-use crate::http::{Visitor, raw_by_tls};
 use crate::program::{Running, records_with, regrind, run, small_recipe};
 use crate::{CellPage, serve_with};
 

@@ -1,6 +1,7 @@
 //! Content of the pages, without a browser.
 
-use crate::http::Visitor;
+use regrind_testcell::http::Visitor;
+
 use crate::program::{replaced, run, run_folders, small_recipe};
 use crate::{CellPage, serve};
 

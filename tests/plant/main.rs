@@ -5,25 +5,14 @@
 //! system and file modes are Unix only.
 #![cfg(unix)]
 
-#[path = "../common/keep.rs"]
-mod keep;
-#[path = "../common/program.rs"]
-mod program;
+regrind_testcell::program!();
 
 mod broker;
-#[path = "../page/browser.rs"]
-#[allow(dead_code, reason = "not every key is pressed here")]
-mod browser;
 mod held;
-#[path = "../page/http.rs"]
-#[allow(dead_code, reason = "users and orders of a cell's page are in its own tests")]
-mod http;
 mod network;
 mod on_broker;
 mod on_opcua;
 mod on_postgres;
-#[path = "../common/outlived.rs"]
-mod outlived;
 mod peers;
 mod postgres;
 

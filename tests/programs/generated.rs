@@ -9,9 +9,9 @@ use std::fs;
 
 use crate::compensate::Shop;
 use crate::path::error_mm;
-use crate::sample::seeds;
 use rand::RngExt;
 use regrind_sim::Rng;
+use regrind_testutils::sample::seeds;
 
 /// Tolerance, in mm: the requested one, a tenth of it, and the rounding to six decimals.
 const TOLERANCE_MM: f64 = 1.1e-5;

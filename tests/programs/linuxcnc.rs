@@ -246,7 +246,7 @@ fn ends_of_feeds(said: &str) -> Vec<[f64; 3]> {
 #[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
 fn rs274_reads_drawn_programs() {
     let (mut read, mut moves) = (0, 0);
-    for seed in 0..crate::sample::seeds(25) {
+    for seed in 0..regrind_testutils::sample::seeds(25) {
         let drawn = crate::generated::drawn(seed);
         let bench = Shop::new(error_mm, &drawn.text);
         // A program that the interpreter refuses (it has another rule for a small arc) is not a base to correct.

@@ -5,8 +5,8 @@
 //! back from its text.
 
 use crate::path::{Part, ProgramStep, correction, part, part_from_below, read, truth, truth_below, wheels, with};
-use crate::sample::{cases, seeds};
 use regrind::compensation::path::{PathOptions, TrackPattern, TrackSpacing, Wheel};
+use regrind_testutils::sample::{cases, seeds};
 
 const PARTS: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"];
 /// Tolerance of a touching place, in millimetres.

@@ -4,8 +4,8 @@
 use std::fs;
 use std::path::Path;
 
-use crate::outlived::{began_once, follow, on_serial_lines};
 use crate::program::{Running, changed, records_with, regrind, replaced, run};
+use regrind_testcell::outlived::{began_once, follow, on_serial_lines};
 use serde_json::Value;
 
 /// Number of good touches that are repeated as controls.
@@ -85,7 +85,7 @@ fn killed_during_retouch_resumes() {
     ];
     let text = fs::read_to_string(recipe(home.path(), 1, 2_000.0)).unwrap();
     let text = few.iter().fold(text, |text, (from, to)| replaced(&text, from, to));
-    let _machines = on_serial_lines(home.path(), text);
+    let _machines = on_serial_lines(regrind, home.path(), text);
     let begin = ["run", "part.toml", "--cell", "cell.toml", "--loaded"];
     let mut running = Running::new(regrind(&begin, home.path()));
     let folder = running.folder(home.path());

@@ -5,13 +5,13 @@ use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-use crate::rig::{PATIENCE, Rig, event, order, small, until};
 use regrind::cell::AlarmId;
 use regrind::device::{
     Armed, Cmm, DeviceError, Identity, Interrupt, Job, Machine, Measurement, ModbusCmm, Plan, Reconciled, Started,
     Status, TargetKind,
 };
 use regrind::drive::{Drive, Notice, Request};
+use regrind_testcell::rig::{PATIENCE, Rig, event, order, small, until};
 
 /// Measuring machine whose first measurement is wrong. It stores the plans that it receives.
 struct Odd {
@@ -21,7 +21,7 @@ struct Odd {
 }
 
 impl Machine for Odd {
-    crate::through::through!(cmm: name, connect, status, claim, prepare, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
+    regrind_testcell::through!(cmm: name, connect, status, claim, prepare, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
 }
 
 impl Cmm for Odd {

@@ -3,11 +3,11 @@
 //!
 //! Only a few worlds: `cargo run --release --example convergence` draws fifty for each recipe and prints the figures.
 
-use crate::sample::seeds;
-use crate::study::{After, Bench, RECIPES, Way};
 use rayon::prelude::*;
 use regrind::compensation::GainRule;
 use regrind::figures::statistics::rms;
+use regrind_testcell::study::{After, Bench, RECIPES, Way};
+use regrind_testutils::sample::seeds;
 
 const PASSES: u16 = 3;
 

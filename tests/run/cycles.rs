@@ -6,12 +6,12 @@
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use crate::sample::seeds;
 use crate::truth::{Truth, truth};
 use crate::worlds::{JOB, Ran, Setup, run, table};
 use nalgebra::{Matrix6, Vector6};
 use regrind::cell::Ending;
 use regrind::geometry::Pose;
+use regrind_testutils::sample::seeds;
 
 /// One cycle of one run: what was measured, and the truth.
 struct Cycle {

@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use nalgebra::{DMatrix, DVector};
 use rand::RngExt;
 use regrind_sim::part::{Aperture, DefectSpec, PartSpec};
+use regrind_testutils::sample::{all, seeds};
 
-use crate::sample::{all, seeds};
 use crate::worlds::{Ran, Setup, Snapshot, run, table};
 
 const RECIPES: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "biconic", "shallow-wave"];

@@ -2,8 +2,9 @@
 
 use std::fs;
 
+use regrind_testutils::sample::cases;
+
 use crate::program::{changed, only_run, run, small_recipe};
-use crate::sample::cases;
 
 /// Returns the simulated cell with a `program` section and long timeouts. The grinder reads megabytes of a program
 /// before it answers, and a stall of the computer must not look like a machine that is gone.

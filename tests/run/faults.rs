@@ -3,10 +3,10 @@
 
 #![cfg(unix)]
 
-use crate::sample::all;
 use crate::worlds::{JOB, Ran, Setup, run, table};
 use regrind::cell::{AlarmId, Ending};
 use regrind_sim::spec::{Mirrored, Misreported, WorldFaults};
+use regrind_testutils::sample::all;
 
 const RECIPE: &str = "freeform-mirror";
 

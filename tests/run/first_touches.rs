@@ -4,13 +4,13 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::outlived::on_serial_lines;
 use crate::program::{Running, changed, records_with, regrind, run, run_folders};
-use crate::study::touch;
 use regrind::recipe::Recipe;
 use regrind_sim::payload::{Feature, Plan, PointRecord, Status, Target};
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
+use regrind_testcell::outlived::on_serial_lines;
+use regrind_testcell::study::touch;
 use serde::Deserialize as _;
 use serde_json::Value;
 
@@ -67,7 +67,7 @@ fn begun_run(home: &Path, running: &mut Running) -> PathBuf {
 fn faults_found_over_serial_line() {
     for (what, world, alarm) in WRONG {
         let home = tempfile::tempdir().unwrap();
-        let _machines = on_serial_lines(home.path(), recipe(world));
+        let _machines = on_serial_lines(regrind, home.path(), recipe(world));
         let mut running =
             Running::new(regrind(&["run", "part.toml", "--cell", "cell.toml", "--loaded", "--json"], home.path()));
         let folder = begun_run(home.path(), &mut running);

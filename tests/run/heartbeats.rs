@@ -6,13 +6,13 @@
 
 use std::time::Duration;
 
-use crate::rig::{CMM, GRINDER, PATIENCE, Rig, event, order, until, words};
 use regrind::cell::Ending;
 use regrind::device::{
     Armed, Cmm, DeviceError, Identified, Identity, Interrupt, Job, Machine, MeasuredPoint, Measurement, ModbusCmm,
     Plan, Reconciled, Started, Status, TouchStatus, digest,
 };
 use regrind::drive::{Drive, Request};
+use regrind_testcell::rig::{CMM, GRINDER, PATIENCE, Rig, event, order, until, words};
 
 const POINTS: usize = 451_401;
 /// Number of targets that are really measured: the reference sphere and a few more.
@@ -26,7 +26,7 @@ struct Generous {
 }
 
 impl Machine for Generous {
-    crate::through::through!(cmm: name, connect, status, claim, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
+    regrind_testcell::through!(cmm: name, connect, status, claim, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
 
     async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
         self.cmm.prepare(Job { digest: self.few, ..job }).await
@@ -58,7 +58,7 @@ impl Cmm for Generous {
 }
 
 fn recipe() -> regrind::recipe::Recipe {
-    crate::rig::recipe(&[
+    regrind_testcell::rig::recipe(&[
         ("columns = 60", "columns = 901"),
         ("rows = 30", "rows = 501"),
         ("accuracy_nm = 0.5", "spacing_mm = 0.118"),

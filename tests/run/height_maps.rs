@@ -203,7 +203,7 @@ struct Ran {
 
 async fn run(seed: u64) -> Ran {
     let home = tempfile::tempdir().unwrap();
-    let _kept = crate::keep::KeepRunFolders(home.path().to_owned());
+    let _kept = regrind_testutils::keep::KeepRunFolders(home.path().to_owned());
     let (shop, folder) = (home.path().join("shop"), home.path().join("run"));
     ["in", "out"].iter().for_each(|name| fs::create_dir_all(shop.join(name)).unwrap());
     let recipe = recipe();

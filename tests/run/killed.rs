@@ -7,14 +7,14 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 
-use crate::outlived::{began_once, follow, on_serial_lines};
 use crate::program::{Running, changed, only_run, records_with, regrind, run_folders};
-use crate::rig::{CMM, GRINDER, Rig, small};
-use crate::sample::seeds;
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
 use regrind::journal::{Reader, RecordKind, verify};
 use regrind_sim::event_log::HandshakeEvent;
+use regrind_testcell::outlived::{began_once, follow, on_serial_lines};
+use regrind_testcell::rig::{CMM, GRINDER, Rig, small};
+use regrind_testutils::sample::seeds;
 
 /// Maximum number of kills of a part's program.
 const MAX_KILLS: usize = 3;
@@ -130,7 +130,7 @@ async fn killed_program_resumes_each_pass_once() {
 #[test]
 fn killed_program_resumes_on_serial_line() {
     let home = tempfile::tempdir().unwrap();
-    let _serving = on_serial_lines(home.path(), small(12, 8, 2000.0).text());
+    let _serving = on_serial_lines(regrind, home.path(), small(12, 8, 2000.0).text());
     let (folder, kills) = run_with_kills(home.path(), 21);
     println!("{kills} kills");
     is_whole(&folder, 21);

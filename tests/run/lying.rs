@@ -5,13 +5,13 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use crate::rig::{PATIENCE, Ready, Rig, event, order, small, until};
 use regrind::cell::{AlarmId, Device, Ending};
 use regrind::device::{
     Armed, Cmm, CorrectionMap, DeviceError, Grinder, Identity, Interrupt, Job, Machine, MachineState, Measurement,
     ModbusCmm, ModbusGrinder, Outcome, Pass, PassRecord, Plan, Reconciled, Started, Status,
 };
 use regrind::drive::{Drive, Notice, Request};
+use regrind_testcell::rig::{PATIENCE, Ready, Rig, event, order, small, until};
 use tokio::sync::mpsc::UnboundedReceiver;
 
 /// Function that changes a machine's reported status.
@@ -31,7 +31,7 @@ impl ScriptedGrinder {
 }
 
 impl Machine for ScriptedGrinder {
-    crate::through::through!(grinder: name, connect, claim, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
+    regrind_testcell::through!(grinder: name, connect, claim, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
 
     async fn status(&mut self) -> Result<Status, DeviceError> {
         let mut status = self.grinder.status().await?;
@@ -74,7 +74,7 @@ struct Odd {
 }
 
 impl Machine for Odd {
-    crate::through::through!(cmm: name, connect, status, claim, prepare, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
+    regrind_testcell::through!(cmm: name, connect, status, claim, prepare, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
 }
 
 impl Cmm for Odd {

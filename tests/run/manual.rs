@@ -10,12 +10,12 @@ use regrind::journal::{Reader, Record};
 use regrind_sim::payload::{Feature, Map, Pass, Plan, PointRecord, Status, Target};
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
+use regrind_testcell::study::{grind, touch};
 use serde::Deserialize;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
 use crate::program::{PATIENCE, Running, changed, regrind, replaced, root, run};
-use crate::study::{grind, touch};
 
 const RADIUS_MM: f64 = 1.5;
 

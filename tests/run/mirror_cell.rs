@@ -6,7 +6,6 @@
 use std::path::Path;
 use std::time::Duration;
 
-use crate::data::data;
 use regrind::device::file_exchange::{
     CmmExchange, CmmFolders, Exchange, MeasureOrder, Pattern, Permit, StationFiles, Stations,
 };
@@ -20,6 +19,7 @@ use regrind::registration::{
     MapLimits, PointStatus, Registration, RegistrationOptions, Start, lateral_error, map_obstacle, register,
 };
 use regrind::surface::{DefinedSurface, Nominal, Side};
+use regrind_testutils::data::data;
 
 const REFLECTOR_MM: f64 = 19.05;
 

@@ -7,9 +7,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::data::data;
 use crate::program::{Running, changed, only_run, run};
 use regrind::journal;
+use regrind_testutils::data::data;
 use serde_json::Value;
 
 const SESSION: &str = "20250824_M1_1";

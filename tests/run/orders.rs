@@ -7,13 +7,13 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
-use crate::rig::{CMM, GRINDER, Ready, Rig, event, order};
-use crate::tries::{MOMENTS, attempt, attempt_with};
 use regrind::cell::{AlarmId, Ending};
 use regrind::drive::{Drive, OrderSender, Request};
 use regrind::journal::{Reader, RecordKind, verify};
 use regrind_sim::command::CommandFrame;
 use regrind_sim::event_log::HandshakeEvent;
+use regrind_testcell::rig::{CMM, GRINDER, Ready, Rig, event, order};
+use regrind_testcell::tries::{MOMENTS, attempt, attempt_with};
 use serde_json::Value;
 
 const DEVICES: [&str; 2] = ["cmm", "grinder"];
@@ -122,7 +122,7 @@ fn watch_the_disk(rig: &Rig, folder: &Arc<Mutex<PathBuf>>, broken: &Arc<Mutex<Ve
 }
 
 async fn at_every_phase(hold: bool) {
-    let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
+    let mut rig = Rig::new(regrind_testcell::rig::small(12, 8, 5000.0)).await;
     let (folder, broken) = (Arc::default(), Arc::default());
     watch_the_disk(&rig, &folder, &broken);
     for moment in &MOMENTS {
@@ -154,14 +154,14 @@ async fn abort_at_every_phase() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn abort_while_journal_is_locked() {
-    let mut rig = Rig::new(crate::rig::small(12, 8, 100.0)).await;
+    let mut rig = Rig::new(regrind_testcell::rig::small(12, 8, 100.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let (drive, _orders) = Drive::new(run, cmm, grinder).unwrap();
     let running = tokio::spawn(drive.run());
     event(&mut notices, "started", 1).await;
 
     let other = rusqlite::Connection::open(folder.join("journal.sqlite")).unwrap();
-    other.busy_timeout(crate::rig::PATIENCE).unwrap();
+    other.busy_timeout(regrind_testcell::rig::PATIENCE).unwrap();
     other.execute_batch("BEGIN IMMEDIATE").unwrap();
     let since = std::time::Instant::now();
     let ordered = tokio::spawn({
@@ -173,7 +173,7 @@ async fn abort_while_journal_is_locked() {
             tokio::task::yield_now().await;
         }
     };
-    tokio::time::timeout(crate::rig::PATIENCE, aborted).await.expect("both machines hear of the abort");
+    tokio::time::timeout(regrind_testcell::rig::PATIENCE, aborted).await.expect("both machines hear of the abort");
     let on_record = |folder: &Path| records(folder, RecordKind::Event).iter().any(|event| event["event"] == "abort");
     assert!(!on_record(&folder), "the journal cannot have it yet");
 
@@ -183,14 +183,14 @@ async fn abort_while_journal_is_locked() {
     // before it is.
     let reply = ordered.await.unwrap();
     assert!(if reply.accepted { on_record(&folder) } else { reply.message.contains("not recorded") }, "{reply:?}");
-    let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
+    let ending = tokio::time::timeout(regrind_testcell::rig::PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
     assert!(on_record(&folder) && verify(&folder).unwrap().closed);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn abort_ends_run_with_broken_journal() {
-    let mut rig = Rig::new(crate::rig::small(12, 8, 100.0)).await;
+    let mut rig = Rig::new(regrind_testcell::rig::small(12, 8, 100.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     let actor = run.actor.clone();
     let (drive, orders): (_, OrderSender) = Drive::new(run, cmm, grinder).unwrap();
@@ -203,7 +203,7 @@ async fn abort_ends_run_with_broken_journal() {
     // each further record.
     event(&mut notices, "record_failed", 1).await;
     orders.send(Request::Abort { reason: "the record is gone".into() }, actor).await;
-    let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
+    let ending = tokio::time::timeout(regrind_testcell::rig::PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
     let mut told = 0;
     while let Some(notice) = notices.recv().await {
@@ -250,12 +250,12 @@ async fn run_to_its_end(ready: Ready) -> (Ending, PathBuf) {
             orders.send(Request::Stop { reason: "seen enough".into() }, actor.clone()).await;
         }
     }
-    (tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap(), folder)
+    (tokio::time::timeout(regrind_testcell::rig::PATIENCE, running).await.expect("it ends").unwrap(), folder)
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn unsaved_result_is_recomputed() {
-    let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
+    let mut rig = Rig::new(regrind_testcell::rig::small(12, 8, 5000.0)).await;
     let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
     // A folder is in the place of the deviations file of the first cycle.
     std::fs::create_dir_all(folder.join("cycle-1/deviations.csv")).unwrap();
@@ -264,7 +264,7 @@ async fn unsaved_result_is_recomputed() {
     let running = tokio::spawn(drive.run());
     event(&mut notices, "not_saved", 1).await;
     orders.send(Request::Resume { reason: "the disk is well again".into(), state_number: None }, actor).await;
-    let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
+    let ending = tokio::time::timeout(regrind_testcell::rig::PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }), "{ending:?}");
     assert!(folder.join("cycle-1/attempt-2/deviations.csv").is_file());
     let raised = records(&folder, RecordKind::Note).into_iter().filter(|note| note["command"] == "raise");
@@ -279,7 +279,7 @@ async fn unsaved_result_is_recomputed() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn amended_verdict_leaves_first_file() {
-    let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
+    let mut rig = Rig::new(regrind_testcell::rig::small(12, 8, 5000.0)).await;
     let mut ready = rig.next(true);
     // Another pass is needed, and then the remaining material is not enough.
     ready.run.task.correction_limits.removal_budget_mm = 1e-6;
@@ -293,7 +293,7 @@ async fn amended_verdict_leaves_first_file() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn every_run_file_is_on_record() {
-    let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
+    let mut rig = Rig::new(regrind_testcell::rig::small(12, 8, 5000.0)).await;
     let ready = rig.next(true);
     let (ending, folder) = run_to_its_end(ready).await;
     assert!(matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }), "{ending:?}");

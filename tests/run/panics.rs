@@ -4,7 +4,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use crate::rig::{CMM, GRINDER, PATIENCE, Rig, event, order, small, until};
 use regrind::cell::{AlarmId, Device, Ending};
 use regrind::device::{
     Armed, CorrectionMap, DeviceError, Grinder, Identity, Interrupt, Job, Machine, ModbusGrinder, Pass, PassRecord,
@@ -12,6 +11,7 @@ use regrind::device::{
 };
 use regrind::drive::{Drive, Notice, Request};
 use regrind_sim::command::State;
+use regrind_testcell::rig::{CMM, GRINDER, PATIENCE, Rig, event, order, small, until};
 
 /// Grinder whose driver has a fault.
 struct Brittle {
@@ -20,7 +20,7 @@ struct Brittle {
 }
 
 impl Machine for Brittle {
-    crate::through::through!(grinder: name, connect, claim, prepare, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
+    regrind_testcell::through!(grinder: name, connect, claim, prepare, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
 
     async fn status(&mut self) -> Result<Status, DeviceError> {
         assert!(!self.breaks.load(Ordering::Acquire), "an index that was out of bounds");

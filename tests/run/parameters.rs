@@ -5,12 +5,12 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
+use regrind_testcell::study::identifiability::Compared;
+use regrind_testcell::study::{After, Bench};
+use regrind_testutils::sample::seeds;
 use serde_json::Value;
 
 use crate::program::{Running, changed, only_run, regrind, root, run, run_folders};
-use crate::sample::seeds;
-use crate::study::identifiability::Compared;
-use crate::study::{After, Bench};
 
 /// A good machine with a wheel whose radius is 0.4 mm too large. The part has at most 1.6 touches per square
 /// centimetre.

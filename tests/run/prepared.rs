@@ -3,9 +3,9 @@
 use std::path::Path;
 use std::time::Duration;
 
-use crate::rig::{changed, recipe};
 use regrind::config::CellConfig;
 use regrind::setup;
+use regrind_testcell::rig::{changed, recipe};
 
 fn cell(file: &str, changes: &[(&str, &str)]) -> CellConfig {
     CellConfig::parse(Path::new("cell.toml"), &changed(file, changes)).unwrap_or_else(|p| panic!("{p:?}"))

@@ -4,13 +4,12 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::contents;
-use crate::rig::{PATIENCE, Ready, Rig, event, small, until};
-use crate::sample::cases;
 use regrind::cell::{CellPlan, HoldOrStop};
 use regrind::drive::{Drive, InterruptedRun, OrderSender, ReplayError, Request, Task};
 use regrind::journal::{Reader, verify};
 use regrind::setup;
+use regrind_testcell::rig::{PATIENCE, Ready, Rig, event, small, until};
+use regrind_testutils::sample::cases;
 
 /// Runs a part of three passes, with a hold during the run. Returns the rig and the folder of the run.
 async fn finished() -> (Rig, PathBuf) {
@@ -26,7 +25,7 @@ async fn finished() -> (Rig, PathBuf) {
     orders.send(Request::Resume { reason: "tea is over".into(), state_number: None }, actor).await;
     tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(verify(&folder).unwrap().closed);
-    contents::assert_known(&folder);
+    crate::contents::assert_known(&folder);
     (rig, folder)
 }
 

@@ -5,11 +5,11 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use crate::data::data;
 use crate::program::{root, run, small_recipe};
 use crate::reports::{RecordWriter, aborted, ada, arguments, figures, json_in, the_run, tolerance};
 use regrind::cell::{Command as CellCommand, Event, Figures, GateFailure, GateResult, Judgement, Verdict};
 use regrind::report::{ResultsFormat, run_results};
+use regrind_testutils::data::data;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 

@@ -2,9 +2,8 @@
 //! `examples/shared.rs`.
 
 use rayon::prelude::*;
-
-use crate::study::transfer::{Differ, Pair, TAUGHT_BY, TransferResult};
-use crate::study::{After, Bench, RECIPES};
+use regrind_testcell::study::transfer::{Differ, Pair, TAUGHT_BY, TransferResult};
+use regrind_testcell::study::{After, Bench, RECIPES};
 
 /// Computes one world of each recipe.
 fn worlds(differ: Differ) -> Vec<TransferResult> {

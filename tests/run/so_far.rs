@@ -3,10 +3,10 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use crate::rig::{CMM, PATIENCE, Ready, Rig, order, small, until};
 use regrind::cell::Ending;
 use regrind::drive::{Drive, PreviewStatistics, Request, Snapshot};
 use regrind_sim::registers::SimulatedMachine;
+use regrind_testcell::rig::{CMM, PATIENCE, Ready, Rig, order, small, until};
 
 fn cmm(rig: &Rig, what: impl FnOnce(&mut SimulatedMachine)) {
     rig.servings[CMM].machines()[0].1.with(what);

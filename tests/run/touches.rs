@@ -5,15 +5,15 @@ use std::fs;
 use std::path::Path;
 
 use crate::killed::run_with_kills;
-use crate::outlived::{began_once, on_serial_lines};
-use crate::program::changed;
-use crate::sample::cases;
+use crate::program::{changed, regrind};
 use crate::worlds::{Ran, Setup, run, table};
 use regrind::cell::AlarmId;
 use regrind::drive::Notice;
 use regrind::journal::{Reader, RecordKind, verify};
 use regrind_sim::part::ShapeSpec;
 use regrind_sim::spec::WorldFaults;
+use regrind_testcell::outlived::{began_once, on_serial_lines};
+use regrind_testutils::sample::cases;
 use serde_json::Value;
 
 fn chosen(recipe: &'static str, seed: u64) -> Setup {
@@ -166,7 +166,7 @@ fn adaptive_resume_repeats_no_touch() {
             ("seed = 1\n", "seed = 1\nspeed = 3000.0\n"),
         ],
     );
-    let _serving = on_serial_lines(home.path(), &recipe);
+    let _serving = on_serial_lines(regrind, home.path(), &recipe);
     let (mut max_kills, mut parts) = (0, 0);
     for seed in cases([31, 32], 2) {
         parts += 1;

@@ -3,10 +3,10 @@
 
 use std::time::{Duration, Instant};
 
-use crate::rig::{CMM, GRINDER, PATIENCE, Ready, Rig, event, order, small, until};
 use regrind::cell::{Alarm, AlarmId, Ending};
 use regrind::drive::{Drive, Notice, Request};
 use regrind_sim::command::{Mode, State, interlock};
+use regrind_testcell::rig::{CMM, GRINDER, PATIENCE, Ready, Rig, event, order, small, until};
 use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::task::JoinHandle;
 

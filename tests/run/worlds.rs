@@ -296,7 +296,7 @@ pub fn run(setup: Setup) -> Ran {
 
 async fn go(setup: Setup) -> Ran {
     let home = tempfile::tempdir().unwrap();
-    let _kept = crate::keep::KeepRunFolders(home.path().to_owned());
+    let _kept = regrind_testutils::keep::KeepRunFolders(home.path().to_owned());
     let folder = home.path().join("run");
     let file = format!("recipes/{}.toml", setup.recipe);
     let text = if setup.coarse { changed(&file, &COARSE) } else { changed(&file, &[]) };

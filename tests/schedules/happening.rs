@@ -34,7 +34,7 @@ use crate::part::{self, RequiredQuality};
 use crate::person::{GivenOrder, Person, actor};
 use crate::schedule::{Act, Schedule, Tally};
 use crate::wire::Wires;
-use crate::wire_faults::{FaultPlan, SharedFaultPlan};
+use regrind_testcell::wire_faults::{FaultPlan, SharedFaultPlan};
 
 /// Time after which no fault is drawn.
 const CALM_AFTER: Duration = Duration::from_secs(90);

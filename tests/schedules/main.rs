@@ -12,8 +12,6 @@
 mod checker;
 mod cue;
 mod happening;
-#[path = "../common/keep.rs"]
-mod keep;
 mod ledger;
 mod life;
 mod machines;
@@ -25,8 +23,6 @@ mod programs;
 mod schedule;
 mod touches;
 mod wire;
-#[path = "../common/wire_faults.rs"]
-mod wire_faults;
 
 use std::panic::AssertUnwindSafe;
 use std::sync::atomic::{AtomicU64, Ordering};

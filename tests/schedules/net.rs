@@ -25,7 +25,7 @@ use tokio::task::AbortHandle;
 use crate::cue::Cues;
 use crate::life::Life;
 use crate::wire::{Listening, Watched, Wires};
-use crate::wire_faults::SharedFaultPlan;
+use regrind_testcell::wire_faults::SharedFaultPlan;
 
 /// Current behaviour of a network.
 #[derive(Clone, Copy, Debug, PartialEq)]

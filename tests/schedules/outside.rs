@@ -21,7 +21,7 @@ use crate::machines::Plant;
 use crate::net::{Net, Weather};
 use crate::person::{GivenOrder, give, take_supplies};
 use crate::schedule::Act;
-use crate::wire_faults::{Fault, FaultPlan, SharedFaultPlan, When};
+use regrind_testcell::wire_faults::{Fault, FaultPlan, SharedFaultPlan, When};
 
 /// Receiver of orders in the current life of the program.
 pub type Office = Arc<Mutex<Option<(OrderSender, Arc<Life>)>>>;

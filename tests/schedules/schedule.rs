@@ -16,7 +16,7 @@ use crate::happening::Happening;
 use crate::ledger::Disk;
 use crate::net::Weather;
 use crate::part::RequiredQuality;
-use crate::wire_faults::Fault;
+use regrind_testcell::wire_faults::Fault;
 
 /// Maximum number of lives of the program that are cut short.
 const MAX_DEATHS: usize = 3;
@@ -310,7 +310,7 @@ impl Schedule {
     pub fn run(&self) -> Result<Tally, String> {
         let (evidence, home) = self.happen();
         let checked = check(&evidence);
-        crate::keep::keep(home.path());
+        regrind_testutils::keep::keep(home.path());
         checked.map(|()| evidence.tally.clone())
     }
 

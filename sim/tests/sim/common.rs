@@ -1,14 +1,14 @@
 //! A client in a few lines: payloads, whole jobs, and what is left of a deviation when the part may be moved.
 #![allow(dead_code)]
 
-use crate::client_payloads::{Encode, decode_pass_record, decode_points};
-use crate::perfect::{perfect_cmm, perfect_grinder};
 use regrind_sim::body::{Payload, Payloads, Physics, ResultData};
 use regrind_sim::grinder::Grinder;
 use regrind_sim::part::{Aperture, PartSpec, ShapeSpec};
 use regrind_sim::payload::{Feature, Map, Pass, PassRecord, Plan, PointRecord, Target};
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
+use regrind_testsim::payloads::{Encode, decode_pass_record, decode_points};
+use regrind_testsim::perfect::{perfect_cmm, perfect_grinder};
 
 /// Identity of the part of these tests.
 pub const NOMINAL: [u8; 32] = [7; 32];

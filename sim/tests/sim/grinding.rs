@@ -1,14 +1,14 @@
 //! The grinder against what can be worked out by hand.
 
-use crate::client_payloads::decode_pass_record;
 use crate::common::{NOMINAL, grind, grinder_payloads, level_mm, map_of, net, pass, run, small_perfect, zero_map};
-use crate::perfect::perfect_grinder;
 use regrind_sim::body::Physics;
 use regrind_sim::part::{PartSpec, ShapeSpec};
 use regrind_sim::payload::Pass;
 use regrind_sim::spec::GrinderSpec;
 use regrind_sim::spec::{Mirrored, WorldFaults, WorldSpec};
 use regrind_sim::world::World;
+use regrind_testsim::payloads::decode_pass_record;
+use regrind_testsim::perfect::perfect_grinder;
 
 const HALF_MM: [f64; 2] = [15.0, 10.0];
 

@@ -3,7 +3,6 @@
 
 use std::time::Duration;
 
-use crate::client_payloads::{Encode, decode_pass_record, decode_points};
 use crate::common::{level_mm, net, pass, plan, small_perfect, zero_map};
 use crate::desk::Desk;
 use regrind_sim::body::Physics;
@@ -11,6 +10,7 @@ use regrind_sim::command::{Answer, Command, State};
 use regrind_sim::options::MachineOptions;
 use regrind_sim::register_encoding::{WordOrder, turn_payload};
 use regrind_sim::world::World;
+use regrind_testsim::payloads::{Encode, decode_pass_record, decode_points};
 
 const HALF_MM: [f64; 2] = [15.0, 10.0];
 

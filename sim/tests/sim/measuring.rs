@@ -1,6 +1,5 @@
 //! The measuring machine against closed forms.
 
-use crate::client_payloads::decode_points;
 use crate::common::{cmm_payloads, measure, net, plan, run, small_perfect};
 use regrind_sim::Vec3;
 use regrind_sim::body::Physics;
@@ -9,6 +8,7 @@ use regrind_sim::payload::{Feature, Plan, Status, Target};
 use regrind_sim::spec::CmmSpec;
 use regrind_sim::spec::{WorldFaults, WorldSpec};
 use regrind_sim::world::World;
+use regrind_testsim::payloads::decode_points;
 
 fn world(spec: WorldSpec) -> World {
     World::new(spec).unwrap()

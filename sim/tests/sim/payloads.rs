@@ -1,7 +1,7 @@
 //! The payloads byte by byte, as docs/modbus.md lays them out, and what is wrong with wrong ones.
 
-use crate::client_payloads::{Encode, decode_pass_record, decode_points};
 use regrind_sim::payload::{Feature, Map, Pass, PassRecord, Plan, PointRecord, Status, Target, encode_points};
+use regrind_testsim::payloads::{Encode, decode_pass_record, decode_points};
 
 const ONE: [u8; 8] = [0x3f, 0xf0, 0, 0, 0, 0, 0, 0];
 const ONE_AND_A_HALF: [u8; 8] = [0x3f, 0xf8, 0, 0, 0, 0, 0, 0];

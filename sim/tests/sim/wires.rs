@@ -5,7 +5,6 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use crate::counter::{Counter, digest, payloads};
-use crate::wire_faults::{Fault, FaultPlan, Serving, SharedFaultPlan, When};
 use regrind_sim::body::Kind;
 use regrind_sim::command::{Command, CommandFrame, State};
 use regrind_sim::options::MachineOptions;
@@ -14,6 +13,7 @@ use regrind_sim::registers::SimulatedMachine;
 #[cfg(unix)]
 use regrind_sim::wire::pty;
 use regrind_sim::wire::rtu::Line;
+use regrind_testsim::wire_faults::{Fault, FaultPlan, Serving, SharedFaultPlan, When};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio_modbus::client::{Context, Reader, Writer};

@@ -125,7 +125,7 @@ fn type_page(page: &str) {
     terminals.values_mut().for_each(Terminal::until_it_ends);
     // End what is still running, and keep the generated files for the checks.
     drop(terminals);
-    crate::keep::keep(home.path());
+    regrind_testutils::keep::keep(home.path());
 }
 
 macro_rules! typed {

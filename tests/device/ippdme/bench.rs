@@ -2,7 +2,6 @@
 
 use std::time::{Duration, Instant};
 
-use crate::perfect::perfect_cmm;
 use regrind::device::Interrupt;
 use regrind::device::ippdme::Limits;
 use regrind::device::{
@@ -15,6 +14,7 @@ use regrind_sim::dme::machine::{self, Options};
 use regrind_sim::spec::{CmmSpec, WorldSpec};
 use regrind_sim::wire::lines::ServingLines;
 use regrind_sim::world::World;
+use regrind_testcell::perfect::perfect_cmm;
 
 pub const RADIUS_MM: f64 = 1.5;
 

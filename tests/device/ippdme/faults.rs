@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use crate::perfect::perfect_cmm;
 use regrind::device::{
     Cmm, DeviceError, Fault as MachineFault, Interrupt, Machine, MachineState, Outcome, Reconciled, Status,
 };
 use regrind_sim::dme::faults::Fault;
+use regrind_testcell::perfect::perfect_cmm;
 
 use super::bench::{Bench, hasty, job, patient, until, until_points, until_still};
 

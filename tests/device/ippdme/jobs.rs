@@ -1,6 +1,5 @@
 //! Jobs from their beginning to their end, with interventions of people and crashes.
 
-use crate::perfect::perfect_cmm;
 use regrind::device::{
     CarefulStart, Cmm, DeviceError, Interrupt, IppdmeCmm, Machine, MachineState, Outcome, Plan, Reconciled, TouchStatus,
 };
@@ -8,6 +7,7 @@ use regrind_sim::dme::machine::Options;
 use regrind_sim::line_server::LineServer;
 use regrind_sim::spec::CmmSpec;
 use regrind_sim::wire::lines::ServingLines;
+use regrind_testcell::perfect::perfect_cmm;
 
 use super::bench::{Bench, begin, has_state, job, patient, settings, until, until_points, until_still};
 

@@ -1,6 +1,5 @@
 //! Scanned rows: their points lie on the part, each at its target, and no fault brings a wrong one.
 
-use crate::perfect::perfect_cmm;
 use regrind::device::{
     Cmm, DeviceError, Fault as MachineFault, Interrupt, IppdmeCmm, Machine, MachineState, Outcome, Plan, PlanTarget,
     Scanning, Status, TargetKind, TouchStatus,
@@ -9,6 +8,7 @@ use regrind_sim::dme::faults::Fault;
 use regrind_sim::dme::machine::Options;
 use regrind_sim::line_server::LineServer;
 use regrind_sim::spec::CmmSpec;
+use regrind_testcell::perfect::perfect_cmm;
 
 use super::bench::{Bench, job, patient, settings, until, until_still};
 

@@ -4,12 +4,10 @@
 use std::path::PathBuf;
 
 use regrind::device::ippdme::{DmeCommand, DmeResponse};
-
-#[path = "../../common/data.rs"]
-mod data;
+use regrind_testutils::data::data;
 
 fn files(extension: &str) -> Vec<(String, String)> {
-    let folder = data::data("nist-ippdme-testsuite").join("test_files");
+    let folder = data("nist-ippdme-testsuite").join("test_files");
     let mut paths: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     paths.retain(|path| path.extension().is_some_and(|found| found == extension));
     paths.sort();

@@ -5,12 +5,12 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
+use regrind_testcell::browser::Browser;
+use regrind_testcell::http::{Answer, Visitor};
 use serde_json::Value;
 
 use super::records::made;
 use crate::Plant;
-use crate::browser::Browser;
-use crate::http::{Answer, Visitor};
 use crate::program::{PATIENCE, Running, regrind, root};
 
 /// Text that would inject an element of a page, end an attribute and an SQL string, and change the reading direction.
@@ -528,7 +528,7 @@ fn plant_page_needs_key_and_is_read_only() {
     let other = Visitor { place: shown.visitor.place.clone(), ..shown.visitor.clone() };
     let foreign =
         format!("GET / HTTP/1.1\r\nHost: plant.example\r\nCookie: {}\r\nConnection: close\r\n\r\n", other.cookies);
-    assert_eq!(crate::http::raw(&other.place, foreign.as_bytes()).status, 421);
+    assert_eq!(regrind_testcell::http::raw(&other.place, foreign.as_bytes()).status, 421);
     // The page accepts no orders.
     let origin = shown.visitor.origin();
     for path in ["/", "/trend", "/runs/1", "/runs/1/orders", "/parts"] {

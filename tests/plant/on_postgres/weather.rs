@@ -11,12 +11,12 @@ use std::time::{Duration, Instant};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use regrind::journal::{Reader, RecordKind, verify};
+use regrind_testcell::outlived::{began_once, follow, on_serial_lines};
 
 use super::work::approves;
 use crate::Plant;
 use crate::broker::Broker;
 use crate::network::Network;
-use crate::outlived::{began_once, follow, on_serial_lines};
 use crate::program::{PATIENCE, Running, changed, regrind};
 
 /// Maximum number of kills of a cell's program for each part that it makes.
@@ -46,7 +46,7 @@ fn cell(plant: &Plant, number: usize, approvers: &str, broker: &Broker) -> (Cell
     let name = format!("cell-{number}");
     let home = plant.path(&name);
     fs::create_dir(&home).unwrap();
-    let machines = on_serial_lines(&home, recipe());
+    let machines = on_serial_lines(regrind, &home, recipe());
     let mut key = regrind(&["audit", "key"], &home);
     let made = key.env("REGRIND_KEY", home.join("audit.key")).output().unwrap();
     assert!(made.status.success());

@@ -16,7 +16,5 @@ mod parameters;
 mod part_priors;
 mod part_shapes;
 mod plausibility;
-#[path = "../../../../tests/common/sample.rs"]
-mod sample;
 mod search;
 mod stopping;

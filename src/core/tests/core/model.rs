@@ -5,9 +5,9 @@
 use nalgebra::{DMatrix, DVector, Matrix6, Vector6};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
+use regrind_testutils::sample::seeds;
 
 use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose};
-use crate::sample::seeds;
 use regrind_core::form::{IsoFits, IsoFormValues, SlopeOperator};
 use regrind_core::geometry::Pose;
 use regrind_core::model::{AngleInterval, BudgetEntry, Form, MachineUncertainty, ModelInputs, UncertaintySource};

@@ -3,9 +3,9 @@
 use nalgebra::{DMatrix, DVector};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
+use regrind_testutils::sample::seeds;
 
 use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
-use crate::sample::seeds;
 use regrind_core::geometry::{Point, Vector};
 use regrind_core::model::{
     Field, Form, Hyperparameters, ModelInputs, Observations, PartFit, PartPriors, Prior, farthest_points,

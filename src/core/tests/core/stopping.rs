@@ -2,9 +2,9 @@
 
 use rand::SeedableRng;
 use rand::rngs::StdRng;
+use regrind_testutils::sample::seeds;
 
 use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
-use crate::sample::seeds;
 use regrind_core::geometry::{Point, Vector};
 use regrind_core::model::{
     FIRST_BATCH, Form, MAX_BATCHES, MIN_TOUCHES, ModelInputs, PartialMeasurement, Reason, StoppingCriteria,

@@ -1,8 +1,8 @@
 //! Files that others made: X3P, SDF and MetroPro maps, and the exports of a laser tracker.
 
-use crate::data::data;
 use regrind_core::geometry::Point;
 use regrind_formats::{FormatError, X3pFile, read_measured, read_metropro, read_sdf, read_x3p};
+use regrind_testutils::data::data;
 
 fn is_about(found: f64, expected: f64) -> bool {
     (found - expected).abs() <= 1e-12 * expected.abs()

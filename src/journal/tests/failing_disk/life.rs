@@ -5,11 +5,10 @@ use std::path::{Path, PathBuf};
 
 use regrind_disk::Disk;
 use regrind_journal::{AuditKey, Entry, Header, Journal, JournalError, Reader, Record, RecordKind, Verified, verify};
+use regrind_testutils::keep::KeepRunFolders;
 use rusqlite::{Connection, OpenFlags};
 use serde_json::{Value, json};
 use tempfile::TempDir;
-
-use crate::keep::KeepRunFolders;
 
 /// Number of log pages that starts a checkpoint. It is small, so that a short life has several checkpoints.
 pub const CHECKPOINT_PAGES: u32 = 24;

@@ -4,8 +4,6 @@
 #![cfg(unix)]
 
 mod faults;
-#[path = "../../../../tests/common/keep.rs"]
-mod keep;
 mod life;
 mod power;
 mod reading;

@@ -1,7 +1,6 @@
 //! The journal: what was acknowledged is there, every change is found, and whoever has no key can sign nothing.
 
-#[path = "../../../../tests/common/keep.rs"]
-mod keep;
+mod closed;
 mod other_verifier;
 mod seals;
 mod tampering;

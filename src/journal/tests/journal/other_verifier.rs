@@ -9,8 +9,9 @@ use regrind_disk::SeededNumbers;
 use regrind_journal::{AuditKey, Entry, Journal, JournalError, Reader, RecordKind, verify};
 use serde_json::{Value, json};
 
+use crate::closed::closed;
 use crate::tampering::{Tampering, copied, long_and_whole, place, tries};
-use crate::written::{closed, header, home, tamper};
+use crate::written::{header, home, tamper};
 
 fn script(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(name)

@@ -13,8 +13,9 @@ use regrind_journal::{
 use rusqlite::Connection;
 use serde_json::{Value, json};
 
+use crate::closed::closed;
 use crate::tampering::{copied, place};
-use crate::written::{Home, closed, header, home, tamper};
+use crate::written::{Home, header, home, tamper};
 
 fn note(k: u64) -> Entry {
     Entry::new(RecordKind::Note, k, 1, json!({ "k": k }))

@@ -8,7 +8,8 @@ use regrind_journal::{JournalError, Reader, Verified, verify};
 use rusqlite::Connection;
 use rusqlite::types::Value;
 
-use crate::written::{Home, closed, long, tamper};
+use crate::closed::closed;
+use crate::written::{Home, long, tamper};
 
 /// Change of a journal, and the first record that fails verification after it.
 pub struct Tampering {

@@ -10,7 +10,8 @@ use regrind_journal::{
 use rusqlite::Connection;
 use serde_json::json;
 
-use crate::written::{closed, header, home, long, tamper};
+use crate::closed::closed;
+use crate::written::{header, home, long, tamper};
 
 #[test]
 fn journal_write_read_verify() {

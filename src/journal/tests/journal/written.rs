@@ -4,12 +4,11 @@ use std::ops::Deref;
 use std::path::{Path, PathBuf};
 
 use ed25519_compact::{KeyPair, Seed};
-use regrind_journal::{Anchor, AuditKey, Entry, Header, Journal, Reader, RecordKind, canonical_json, sha256_hex};
+use regrind_journal::{AuditKey, Header, Journal, Reader, canonical_json, sha256_hex};
+use regrind_testutils::keep::keep;
 use rusqlite::Connection;
 use serde_json::{Value, json};
 use tempfile::TempDir;
-
-use crate::keep::keep;
 
 /// Folder that is deleted after the test. Its journals are kept for the Python verifier on request.
 pub struct Home(TempDir);
@@ -42,25 +41,6 @@ pub fn header() -> Header {
         first_command_id: 1,
         content: json!({ "recipe": "abc" }),
     }
-}
-
-/// Creates a closed run of a few records.
-pub fn closed() -> (Home, PathBuf, Anchor) {
-    let home = home();
-    let folder = home.path().join("runs/run-1");
-    let mut journal = Journal::create(&folder, header()).unwrap();
-    for cycle in 1..4 {
-        let id = journal.intend(Entry::new(RecordKind::Intent, 5, cycle, json!({ "command": "register" }))).unwrap();
-        journal
-            .append(Entry {
-                command_id: Some(id),
-                ..Entry::new(RecordKind::Outcome, 6, cycle, json!({ "z": 1.5, "a": "ü\n" }))
-            })
-            .unwrap();
-        journal.store(&format!("cycle-{cycle}/measured.csv"), b"1,2,3\n", 7, cycle).unwrap();
-    }
-    let anchor = journal.close(9, 3, json!("accepted")).unwrap();
-    (home, folder, anchor)
 }
 
 /// Changes the database by SQL, after it has removed the triggers that protect the records.

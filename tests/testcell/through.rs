@@ -1,9 +1,10 @@
 //! Wrapper of a machine that forwards every call that the test does not change.
 
 /// Generates the listed methods of `Machine`, each forwarded to a field. The test implements the methods that are not
-/// listed.
+/// listed, and imports the types of `regrind::device` that the methods name.
+#[macro_export]
 macro_rules! through {
-    ($field:ident: $($method:ident),+ $(,)?) => { $(crate::through::through!(@$method $field);)+ };
+    ($field:ident: $($method:ident),+ $(,)?) => { $($crate::through!(@$method $field);)+ };
     (@name $field:ident) => {
         fn name(&self) -> &str {
             self.$field.name()
@@ -40,4 +41,3 @@ macro_rules! through {
         }
     };
 }
-pub(crate) use through;

@@ -7,10 +7,6 @@
 //! before the next, on the disk that holds the folder for temporary files (TMPDIR). Beside the journal stands what the disk itself takes
 //! for as many bytes and a sync.
 
-#[path = "../../../tests/common/keep.rs"]
-mod keep;
-#[allow(dead_code, reason = "the tests of the journal use all of it")]
-#[path = "../tests/journal/written.rs"]
 mod written;
 
 use std::io::Write;

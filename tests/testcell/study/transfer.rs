@@ -12,9 +12,14 @@ use super::{After, Bench, Line, Way};
 /// How the second machine differs from the first.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Differ {
-    /// Every number of the systematic errors of either machine differs independently from that of their type by this
-    /// RMS share, and each machine has its own waviness of this amplitude, in µm.
-    By { share: f64, waviness_um: f64 },
+    /// Every number of the systematic errors of either machine differs independently from that of their type, and each
+    /// machine has its own waviness.
+    By {
+        /// RMS share by which a number differs.
+        share: f64,
+        /// Amplitude of the waviness.
+        waviness_um: f64,
+    },
     /// The second machine has nothing in common with the first: every number is drawn independently, including its
     /// sign.
     Unrelated,
@@ -23,24 +28,26 @@ pub enum Differ {
 /// One world: results of the first part on the second machine, with and without the state learned on the first machine.
 #[derive(Clone, Debug)]
 pub struct TransferResult {
-    /// Truth after each pass.
+    /// Truth after each pass, with the learned state.
     pub with: Vec<After>,
+    /// Truth after each pass, without it.
     pub without: Vec<After>,
     /// RMS of the difference between the repeatable errors of the two machines, in µm.
     pub apart_um: f64,
-    /// Number of wavelength bands in which a learned error was transferred, and the maximum RMS share by which the
-    /// machines were assumed to differ.
+    /// Number of wavelength bands in which a learned error was transferred.
     pub bands: usize,
+    /// Maximum RMS share by which the machines were assumed to differ.
     pub differ: f64,
 }
 
 /// Number of parts of the recipe that the first machine has made.
 pub const TAUGHT_BY: u32 = 2;
 
-/// Two recipes that both machines know: the one whose learned state is transferred, and the one by which the machines
-/// are compared.
+/// Two recipes that both machines know.
 pub struct Pair<'a> {
+    /// Recipe whose learned state is transferred.
     pub taught: &'a Bench,
+    /// Recipe by which the machines are compared.
     pub in_common: &'a Bench,
 }
 

@@ -5,8 +5,10 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 
 /// Guard that keeps the run folders below a folder when it goes out of scope.
-#[allow(dead_code, reason = "not every test that includes this uses all of it")]
-pub struct KeepRunFolders(pub PathBuf);
+pub struct KeepRunFolders(
+    /// Folder that holds the run folders.
+    pub PathBuf,
+);
 
 impl Drop for KeepRunFolders {
     fn drop(&mut self) {

@@ -1,5 +1,4 @@
 //! Simulated cell in the process of a test: the world, its wires, and any number of runs, one after the other.
-#![allow(dead_code, reason = "not every test that includes this uses all of it")]
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
@@ -17,6 +16,7 @@ use regrind_sim::options::MachineOptions;
 use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
+use regrind_testutils::root;
 use serde::Deserialize;
 use serde_json::json;
 use tempfile::TempDir;
@@ -24,7 +24,9 @@ use tokio::sync::mpsc;
 
 /// Longest wait for any event that must happen.
 pub const PATIENCE: Duration = Duration::from_secs(120);
+/// Index of the CMM in the pairs of a [`Rig`].
 pub const CMM: usize = 0;
+/// Index of the grinder in the pairs of a [`Rig`].
 pub const GRINDER: usize = 1;
 
 /// Returns the text of a shipped file with some strings replaced.
@@ -35,10 +37,6 @@ pub fn changed(file: &str, changes: &[(&str, &str)]) -> String {
         text = text.replacen(from, to, 1);
     }
     text
-}
-
-pub fn root() -> &'static Path {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
 /// Returns the shipped free-form mirror on a coarser grid, so that a cycle takes about a second.
@@ -54,6 +52,7 @@ pub fn small(columns: u32, rows: u32, speed: f64) -> Recipe {
     recipe(&changes)
 }
 
+/// Returns the shipped free-form mirror with some strings replaced.
 pub fn recipe(changes: &[(&str, &str)]) -> Recipe {
     let text = changed("recipes/freeform-mirror.toml", changes);
     Recipe::parse(&root().join("recipes/freeform-mirror.toml"), &text).unwrap_or_else(|p| panic!("{p:?}"))
@@ -62,6 +61,7 @@ pub fn recipe(changes: &[(&str, &str)]) -> Recipe {
 /// Request that arrived at a simulated machine, with its time.
 #[derive(Clone, Copy, Debug)]
 pub struct ReceivedRequest {
+    /// Time of arrival.
     pub at: Instant,
     /// True if the request changed the heartbeat.
     pub beat: bool,
@@ -74,31 +74,43 @@ pub type Watch = Box<dyn FnMut(u16) + Send>;
 
 /// The world and its wires.
 pub struct Rig {
+    /// Parts and machines.
     pub world: World,
+    /// Servers of the CMM and the grinder.
     pub servings: [Serving; 2],
+    /// Requests that arrived at each machine during the current run.
     pub came: [Arc<Mutex<Vec<ReceivedRequest>>>; 2],
+    /// Recipe of every run.
     pub recipe: Recipe,
+    /// Cell with the ports of the servers.
     pub cell: CellConfig,
+    /// Folder of the run folders.
     pub home: TempDir,
     runs: u32,
 }
 
 /// Run that is complete except for its drive.
 pub struct Ready {
+    /// Inputs of the drive.
     pub run: RunInputs,
+    /// Driver of the CMM.
     pub cmm: ModbusCmm,
+    /// Driver of the grinder.
     pub grinder: ModbusGrinder,
+    /// Notices of the drive.
     pub notices: mpsc::UnboundedReceiver<Notice>,
+    /// Folder of the run.
     pub folder: PathBuf,
 }
 
 impl Drop for Rig {
     fn drop(&mut self) {
-        crate::keep::keep(self.home.path());
+        regrind_testutils::keep::keep(self.home.path());
     }
 }
 
 impl Rig {
+    /// Creates the world of a recipe and serves its machines on free ports.
     pub async fn new(recipe: Recipe) -> Self {
         let spec = WorldSpec::deserialize(toml::Value::Table(recipe.simulation.clone().unwrap())).unwrap();
         let speed = spec.speed;

@@ -11,6 +11,7 @@ use serde_json::{Value, json};
 
 use crate::program::PATIENCE;
 
+/// Headless browser, which ends with the test.
 pub struct Browser {
     child: Child,
     to: File,
@@ -53,6 +54,7 @@ impl Browser {
         Self { child, to, from, sent: 0, events: Vec::new() }
     }
 
+    /// Calls a method of the browser, or of a tab by its session. Returns the result.
     pub fn send(&mut self, session: Option<&str>, method: &str, params: Value) -> Value {
         self.sent += 1;
         let id = self.sent;
@@ -95,11 +97,13 @@ impl Drop for Browser {
     }
 }
 
+/// Tab with a page.
 pub struct Tab {
     session: String,
 }
 
 impl Tab {
+    /// Calls a method of the tab. Returns the result.
     pub fn send(&self, browser: &mut Browser, method: &str, params: Value) -> Value {
         browser.send(Some(&self.session), method, params)
     }

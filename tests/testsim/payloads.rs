@@ -1,5 +1,4 @@
 //! Client's end of the payloads of docs/modbus.md, for tests that act as the client of a simulated machine.
-#![allow(dead_code, reason = "not every test that includes this uses all of it")]
 
 use regrind_sim::payload::{Map, Pass, PassRecord, Plan, PointRecord, Status};
 

@@ -1,17 +1,20 @@
 //! One run that another terminal holds, resumes and aborts at a chosen moment, with the results.
-#![allow(dead_code, reason = "not every test that includes this uses all of it")]
 
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use regrind::cell::Ending;
 use regrind::drive::{Drive, Request};
 
-use crate::rig::{CMM, GRINDER, Rig, event, order, until, words};
+use crate::rig::{CMM, GRINDER, PATIENCE, Ready, Rig, event, order, until, words};
 
-/// Moment of a run: a name, the events to wait for, and whether the loading of the part is confirmed automatically.
+/// Moment of a run, as the events that lead to it.
 pub struct Moment {
+    /// Name of the moment.
     pub name: &'static str,
+    /// Events to wait for, each with its number of occurrences.
     pub after: &'static [(&'static str, usize)],
+    /// True if the loading of the part is confirmed automatically.
     pub loaded: bool,
 }
 
@@ -45,31 +48,31 @@ pub struct Tried {
     pub state: String,
     /// Time until the HOLD is on the wire; `None` if no machine moved.
     pub hold: Option<Duration>,
+    /// Time until the HOLD is answered.
     pub hold_answered: Option<Duration>,
     /// Time until the RESUME is on the wire; `None` if no machine was held.
     pub resume: Option<Duration>,
+    /// Time until the RESUME is answered.
     pub resume_answered: Option<Duration>,
     /// Time until the ABORT is on each wire.
     pub abort: Vec<Duration>,
+    /// Time until the ABORT is answered.
     pub abort_answered: Duration,
     /// Commands that arrived at a machine after its ABORT, other than ABORT and the RELEASE that gives the machine
     /// back.
     pub after_abort: Vec<u16>,
 }
 
-/// Starts a run, holds and resumes it at a moment if `hold` is set, aborts it, and follows it to its end.
-pub async fn attempt(rig: &mut Rig, moment: &Moment, hold: bool) -> (Tried, std::path::PathBuf) {
+/// Starts a run, holds and resumes it at a moment if `hold` is set, aborts it, and follows it to its end. Returns the
+/// results and the run folder.
+pub async fn attempt(rig: &mut Rig, moment: &Moment, hold: bool) -> (Tried, PathBuf) {
     let ready = rig.next(moment.loaded);
     attempt_with(rig, ready, moment, hold).await
 }
 
-pub async fn attempt_with(
-    rig: &Rig,
-    ready: crate::rig::Ready,
-    moment: &Moment,
-    hold: bool,
-) -> (Tried, std::path::PathBuf) {
-    let crate::rig::Ready { run, cmm, grinder, mut notices, folder } = ready;
+/// Does the same as [`attempt`] with a run that is prepared already.
+pub async fn attempt_with(rig: &Rig, ready: Ready, moment: &Moment, hold: bool) -> (Tried, PathBuf) {
+    let Ready { run, cmm, grinder, mut notices, folder } = ready;
     let (drive, _orders) = Drive::new(run, cmm, grinder).unwrap();
     let running = tokio::spawn(drive.run());
     for (name, times) in moment.after {
@@ -85,7 +88,7 @@ pub async fn attempt_with(
     if !hold {
         tried.state = reply.message;
     }
-    let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
+    let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{}: {ending:?}", moment.name);
     for machine in [CMM, GRINDER] {
         let at = rig.command_at(machine, 7, began).expect("ABORT came to both machines");
@@ -97,7 +100,7 @@ pub async fn attempt_with(
     (tried, folder)
 }
 
-async fn hold_and_resume(rig: &Rig, folder: &std::path::Path, tried: &mut Tried) {
+async fn hold_and_resume(rig: &Rig, folder: &Path, tried: &mut Tried) {
     let (reply, began, took) = order(folder, Request::Hold { reason: "a try".into() }).await;
     assert!(reply.accepted, "{reply:?}");
     tried.hold_answered = Some(took);

@@ -2,10 +2,7 @@
 //! against what may come out. An error is fine; a panic is not, nor is a number that is none. Each returns whether
 //! something was read.
 //!
-//! `fuzz_targets` gives them what libFuzzer thinks of, `tests/parsers.rs` a bounded number of damaged samples.
-
-// Each target takes one of them.
-#![allow(dead_code)]
+//! `fuzz/fuzz_targets` gives them what libFuzzer thinks of, `tests/parsers.rs` a bounded number of damaged samples.
 
 use std::fs;
 use std::io::{Cursor, Write};
@@ -32,14 +29,11 @@ use regrind::journal::{Anchor, Reader, canonical_json, verify};
 use regrind::recipe::Recipe;
 use regrind::surface::DefinedSurface;
 use regrind_sim::payload;
+use regrind_testcell::payloads::{self, Encode};
+use regrind_testutils::root;
 use serde::{Serialize, de::DeserializeOwned};
 use serde_json::Value;
 use tempfile::TempDir;
-
-#[path = "../tests/common/payloads.rs"]
-pub mod payloads;
-
-use payloads::Encode;
 
 fn path() -> &'static Path {
     Path::new("any.file")
@@ -188,22 +182,16 @@ pub fn definition(bytes: &[u8]) -> bool {
     true
 }
 
-/// The top of the sources, whichever package this is built in.
-fn home() -> &'static Path {
-    let package = Path::new(env!("CARGO_MANIFEST_DIR"));
-    if package.ends_with("fuzz") { package.parent().unwrap_or(package) } else { package }
-}
-
 /// A recipe, beside those that ship.
 pub fn recipe(bytes: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(bytes) else { return false };
-    assert_told(text, Recipe::parse(&home().join("recipes/any.toml"), text).err())
+    assert_told(text, Recipe::parse(&root().join("recipes/any.toml"), text).err())
 }
 
 /// A cell file, beside those that ship.
 pub fn cell(bytes: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(bytes) else { return false };
-    assert_told(text, CellConfig::parse(&home().join("config/any.toml"), text).err())
+    assert_told(text, CellConfig::parse(&root().join("config/any.toml"), text).err())
 }
 
 /// Every problem has a place in the text.
@@ -277,8 +265,8 @@ fn folder() -> TempDir {
 // ---- the record ---------------------------------------------------------------------------------------------------------------------
 
 /// The journal of a small run as it lies on the disk, and its anchor.
-const JOURNAL: &[u8] = include_bytes!("journal/journal.sqlite");
-const ANCHOR: &[u8] = include_bytes!("journal/journal.anchor");
+const JOURNAL: &[u8] = include_bytes!("../../fuzz/journal/journal.sqlite");
+const ANCHOR: &[u8] = include_bytes!("../../fuzz/journal/journal.anchor");
 
 /// Reads and verifies a run of these files.
 fn judge(journal: &[u8], anchor: &[u8]) -> bool {

@@ -1,5 +1,4 @@
 //! Number of seeds that a test draws: a few that are the same in every run, or more if `REGRIND_SEEDS` is set.
-#![allow(dead_code, reason = "not every test that includes this uses all of it")]
 
 /// Returns true if tests draw all their cases, that is, if `REGRIND_SEEDS` is set.
 pub fn all() -> bool {

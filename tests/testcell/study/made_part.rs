@@ -1,19 +1,19 @@
 //! Whole parts, ground and measured until they are accepted: with the whole pattern, or with touches that are chosen
 //! batch by batch.
 
-use crate::client_payloads::Encode;
+use crate::payloads::Encode;
 use regrind::cell::PvPoints;
-use regrind::compensation::map_from_model;
+use regrind::compensation::{GainRule, map_from_model};
 use regrind::drive::AdaptiveOptions;
 use regrind::figures::FormFigures;
 use regrind::geometry::{DeviationSample, Point, Vector};
 use regrind::model::{self, FIRST_BATCH, Form, FormPoint, MIN_TOUCHES, ModelInputs, PartialMeasurement};
 use regrind::registration::Registration;
-use regrind_sim::body::Physics;
+use regrind_sim::body::{Payload, Payloads, Physics};
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
 
-use super::{Bench, GainRule, Line, Way};
+use super::{Bench, Line, Way};
 
 /// How a part is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,10 +27,15 @@ pub enum Measured {
 /// Result of a part.
 #[derive(Clone, Debug, Default)]
 pub struct Made {
+    /// Number of passes.
     pub passes: u32,
+    /// Number of touches in all passes.
     pub touches: usize,
+    /// Duration of all measurements.
     pub touching_s: f64,
+    /// Duration of all passes.
     pub grinding_s: f64,
+    /// True if the part was accepted.
     pub accepted: bool,
     /// RMS and PV of the truth after the last pass, at the targets, in µm, relative to its own best-fit pose.
     pub truth_um: [f64; 2],
@@ -120,8 +125,8 @@ impl Line<'_> {
     /// Grinds one pass and returns its duration in seconds.
     pub(super) fn ground(&mut self, cycle: u16) -> f64 {
         let (map, pass) = (self.payload(), super::pass_of(&self.bench.task, self.correction.level_mm));
-        let payload = |bytes: Vec<u8>, kind: u8| Some(super::Payload { bytes, identity: [kind; 32] });
-        let payloads = super::Payloads { plan: None, map: payload(map.encode(), 2), pass: payload(pass.encode(), 3) };
+        let payload = |bytes: Vec<u8>, kind: u8| Some(Payload { bytes, identity: [kind; 32] });
+        let payloads = Payloads { plan: None, map: payload(map.encode(), 2), pass: payload(pass.encode(), 3) };
         let grinder = &mut self.grinders[0];
         grinder.prepare(self.job, cycle, &payloads).unwrap();
         grinder.begin();

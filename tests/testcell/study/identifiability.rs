@@ -5,52 +5,47 @@ use regrind::compensation::path::nominal_height_field;
 use regrind::compensation::{GainRule, ParameterKind, SurfacePoint, WheelTerm};
 use regrind::drive::ParameterCompensation;
 use regrind::geometry::Grid;
-use regrind_sim::spec::WorldSpec;
+use regrind_sim::spec::{GrinderSpec, WorldSpec};
 use regrind_sim::world::World;
 
-use super::{After, Bench, GrinderSpec, Line, Way};
+use super::{After, Bench, Line, Machine, Way};
 
 /// Expanded uncertainties of the radius of a wheel as dressed, of the setting of the wheel and the clamping of a part,
 /// and of the datum of the CMM.
-pub const RADIUS_UM: f64 = 100.0;
-pub const SETTING_UM: f64 = 15.0;
-pub const TILT_URAD: f64 = 60.0;
-pub const DATUM_UM: f64 = 0.5;
+const RADIUS_UM: f64 = 100.0;
+const SETTING_UM: f64 = 15.0;
+const TILT_URAD: f64 = 60.0;
+const DATUM_UM: f64 = 0.5;
 /// Bow of the slides, to either side, in µm.
 const STRAIGHT_UM: f64 = 0.6;
 /// Maximum ratio of the error after a pass to the error that the pass adds by itself, for the pass to be at the floor.
-pub const AT_FLOOR: f64 = 1.2;
-
-/// Errors of the machine in addition to the manual settings.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub enum Machine {
-    /// Small errors: slides on air or oil, within 0.1 µm over 25 mm, and a cooled spindle.
-    #[default]
-    Good,
-    /// The errors of the recipe.
-    AsShipped,
-}
+const AT_FLOOR: f64 = 1.2;
 
 /// Results of one world.
 #[derive(Clone, Debug)]
 pub struct Compared {
-    /// Estimates of the parameters. Each has its kind, the error of the estimate (estimate minus truth) divided by the
-    /// expanded uncertainty, the expanded uncertainty, the true value, the value that was compensated, and a flag for a
-    /// compensated value that exceeds its tolerance.
+    /// Estimates of the parameters.
     pub parameters: Vec<ParameterResult>,
-    /// Truth after every pass, with parameters and by the map alone.
+    /// Truth after every pass, with parameters.
     pub with: Vec<After>,
+    /// Truth after every pass, by the map alone.
     pub alone: Vec<After>,
 }
 
-/// Estimate of one parameter.
+/// Estimate of one parameter. Values are in the unit in which the parameter is displayed.
 #[derive(Clone, Copy, Debug)]
 pub struct ParameterResult {
+    /// Parameter.
     pub kind: ParameterKind,
+    /// Estimate minus truth, divided by the expanded uncertainty.
     pub off: f64,
+    /// Expanded uncertainty of the estimate.
     pub expanded: f64,
+    /// True value.
     pub truth: f64,
+    /// Value that was compensated.
     pub taken: f64,
+    /// True if the compensated value exceeds its tolerance.
     pub is_beyond: bool,
 }
 
@@ -114,13 +109,7 @@ impl Bench {
 
     fn line_of(&self, spec: &WorldSpec, passes: u16) -> (Vec<ParameterResult>, Vec<After>) {
         let of = &spec.grinder;
-        let alone = GrinderSpec {
-            repeatability_um: of.repeatability_um,
-            repeatability_correlation_mm: of.repeatability_correlation_mm,
-            error_copying: of.error_copying,
-            ..perfect_grinder()
-        };
-        let twin = WorldSpec { grinder: alone, ..spec.clone() };
+        let twin = super::random_alone(spec);
         let still =
             WorldSpec { grinder: GrinderSpec { repeatability_um: 0.0, ..twin.grinder.clone() }, ..twin.clone() };
         let [world, twin, still] = [spec.clone(), twin, still].map(|spec| World::new(spec).unwrap());
@@ -215,7 +204,8 @@ pub fn corrections(after: &[After]) -> usize {
     after.iter().position(|a| a.repeatable_um.hypot(floor_um) <= AT_FLOOR * floor_um).unwrap_or(after.len())
 }
 
-pub fn normal(rng: &mut regrind_sim::Rng) -> f64 {
+/// Draws a number of the standard normal distribution.
+pub(super) fn normal(rng: &mut regrind_sim::Rng) -> f64 {
     use rand::RngExt as _;
     let [a, b]: [f64; 2] = [rng.random(), rng.random()];
     (-2.0 * (1.0 - a).ln()).sqrt() * (std::f64::consts::TAU * b).cos()

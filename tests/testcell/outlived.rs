@@ -1,14 +1,14 @@
 //! Programs that are killed in the middle of a run, and machines that outlive them.
-#![allow(dead_code, reason = "not every test that includes this uses all of it")]
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use regrind::cell::StateName;
 use regrind::drive::{Request, send_request};
 use serde_json::Value;
 
-use crate::program::{PATIENCE, Running, changed, regrind};
+use crate::program::{PATIENCE, Running, changed};
 
 /// Follows a program until it has printed this number of lines and then kills it, or follows it to its end. Resumes the
 /// cell wherever it holds, as a person would. Returns the exit code if the program reached its end.
@@ -36,8 +36,8 @@ pub fn follow(running: &mut Running, folder: &dyn Fn() -> Option<PathBuf>, lines
 }
 
 /// Starts simulated machines on serial lines, served by the program itself, and writes a cell file for them and this
-/// recipe.
-pub fn on_serial_lines(home: &Path, recipe: impl AsRef<[u8]>) -> Running {
+/// recipe. `regrind` is the function of that name in the test binary.
+pub fn on_serial_lines(regrind: fn(&[&str], &Path) -> Command, home: &Path, recipe: impl AsRef<[u8]>) -> Running {
     fs::write(home.join("part.toml"), recipe).unwrap();
     let devices = format!("device = \"{}/", home.display());
     let cell = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);

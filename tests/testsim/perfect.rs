@@ -1,5 +1,4 @@
 //! Simulated machines without errors.
-#![allow(dead_code, reason = "not every test that includes this uses all of it")]
 
 use regrind_sim::spec::{CmmSpec, GrinderSpec};
 

@@ -1,5 +1,7 @@
 //! Runs the program as a process that ends with the test.
-#![allow(dead_code, reason = "not every test that includes this uses all of it")]
+//!
+//! Only a test binary knows the path of the program: [`program!`](crate::program!) defines a module `program` there, with
+//! the names of this module and the functions `regrind` and `run`.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Read};
@@ -8,14 +10,35 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
+pub use regrind_testutils::root;
 use serde_json::Value;
+
+/// Defines the module `program` of a test binary: everything in [`mod@program`], and two functions that run the program
+/// that cargo has built.
+#[macro_export]
+macro_rules! program {
+    () => {
+        mod program {
+            use std::path::Path;
+            use std::process::Command;
+
+            pub use $crate::program::*;
+
+            /// Returns the command that runs the program in a folder with these arguments.
+            pub fn regrind(arguments: &[&str], folder: &Path) -> Command {
+                command(env!("CARGO_BIN_EXE_regrind"), arguments, folder)
+            }
+
+            /// Runs the program to its end. Returns its exit code, its output and its error stream.
+            pub fn run(arguments: &[&str], folder: &Path) -> (i32, String, String) {
+                run_to_end(regrind(arguments, folder), folder)
+            }
+        }
+    };
+}
 
 /// Longest wait for any event that must happen.
 pub const PATIENCE: Duration = Duration::from_secs(300);
-
-pub fn root() -> &'static Path {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
-}
 
 /// Returns the text of a shipped file, with every occurrence of some strings replaced.
 pub fn changed(file: &str, changes: &[(&str, &str)]) -> String {
@@ -48,8 +71,9 @@ pub fn small_recipe(folder: &Path, speed: f64) -> PathBuf {
     path
 }
 
-pub fn regrind(arguments: &[&str], folder: &Path) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_regrind"));
+/// Returns the command that runs a program in a folder with these arguments.
+pub fn command(program: &str, arguments: &[&str], folder: &Path) -> Command {
+    let mut command = Command::new(program);
     command.args(arguments).current_dir(folder).stdin(Stdio::null());
     // The person who runs the tests may have a key. Here records are signed only where a test asks for it.
     command.env("REGRIND_KEY", "");
@@ -62,12 +86,14 @@ pub struct Running {
     lines: Receiver<String>,
     errors: Option<std::thread::JoinHandle<String>>,
     folder: Option<PathBuf>,
+    /// Lines that were read so far.
     pub output_lines: Vec<String>,
     /// Text of the error stream, once the process has ended.
     pub error_text: String,
 }
 
 impl Running {
+    /// Starts a command.
     pub fn new(mut command: Command) -> Self {
         let folder = command.get_current_dir().map(Path::to_owned);
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
@@ -84,7 +110,7 @@ impl Running {
         Self { child, lines, errors: Some(errors), folder, output_lines: Vec::new(), error_text: String::new() }
     }
 
-    /// Waits for a line that satisfies a condition.
+    /// Waits for a line that satisfies a condition, and returns it.
     pub fn line(&mut self, what: &str, will_do: impl Fn(&str) -> bool) -> String {
         let began = Instant::now();
         while let Ok(line) = self.lines.recv_timeout(PATIENCE.saturating_sub(began.elapsed())) {
@@ -97,7 +123,7 @@ impl Running {
         panic!("no {what}:\n{}\n{}", self.output_lines.join("\n"), self.errors.take().unwrap().join().unwrap());
     }
 
-    /// Waits until a condition is true, while the program runs.
+    /// Waits until a condition is true, while the program runs, and returns what it found.
     pub fn until<T>(&mut self, what: &str, mut is_so: impl FnMut(&[String]) -> Option<T>) -> T {
         let began = Instant::now();
         loop {
@@ -118,6 +144,7 @@ impl Running {
         self.output_lines.len()
     }
 
+    /// Returns true if the process has ended.
     pub fn is_over(&mut self) -> bool {
         self.child.try_wait().unwrap().is_some()
     }
@@ -132,12 +159,14 @@ impl Running {
         self.signal("INT");
     }
 
+    /// Sends a signal, such as `KILL`.
     pub fn signal(&self, name: &str) {
         // `kill` is built into the shell.
         let done = Command::new("sh").args(["-c", &format!("kill -{name} {}", self.child.id())]).status().unwrap();
         assert!(done.success());
     }
 
+    /// Returns the number of the process.
     pub fn id(&self) -> u32 {
         self.child.id()
     }
@@ -181,14 +210,14 @@ impl Drop for Running {
         // The process may have ended long ago.
         let _ = self.child.kill();
         let _ = self.child.wait();
-        self.folder.iter().for_each(|folder| crate::keep::keep(folder));
+        self.folder.iter().for_each(|folder| regrind_testutils::keep::keep(folder));
     }
 }
 
-/// Runs the program to its end.
-pub fn run(arguments: &[&str], folder: &Path) -> (i32, String, String) {
-    let Output { status, stdout, stderr } = regrind(arguments, folder).output().unwrap();
-    crate::keep::keep(folder);
+/// Runs a command to its end in a folder. Returns its exit code, its output and its error stream.
+pub fn run_to_end(mut command: Command, folder: &Path) -> (i32, String, String) {
+    let Output { status, stdout, stderr } = command.output().unwrap();
+    regrind_testutils::keep::keep(folder);
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
     (status.code().unwrap_or(-1), text(stdout), text(stderr))
 }

@@ -2,7 +2,6 @@
 //!
 //! A [`FaultPlan`] is a list of rules; each selects requests and gives their faults. Random choices come from a seed,
 //! so a plan breaks the same requests in every run with the same order of requests.
-#![allow(dead_code, reason = "not every test that includes this uses all of it")]
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;

@@ -13,12 +13,16 @@ use serde_json::Value;
 /// HTTP response.
 #[derive(Debug)]
 pub struct Answer {
+    /// Status code, or 0 if there was no response.
     pub status: u16,
+    /// Status line and headers.
     pub head: String,
+    /// Bytes after the headers.
     pub body: Vec<u8>,
 }
 
 impl Answer {
+    /// Returns the body as text.
     pub fn text(&self) -> String {
         String::from_utf8_lossy(&self.body).into_owned()
     }
@@ -62,8 +66,11 @@ fn asked(mut stream: impl Read + Write, request: &[u8]) -> Answer {
 /// Browser without a display.
 #[derive(Clone, Debug)]
 pub struct Visitor {
+    /// Host and port to connect to.
     pub place: String,
+    /// Value of the header `Cookie`.
     pub cookies: String,
+    /// Value of the header `Accept-Language`.
     pub language: String,
     /// Trusted certificates, and the name by which the client knows the page, if the connection is encrypted.
     pub tls: Option<(Arc<ClientConfig>, String)>,
@@ -93,6 +100,7 @@ impl Visitor {
         visitor.sign_in(name, password)
     }
 
+    /// Signs in with a name and a password; none if the page refuses.
     pub fn sign_in(mut self, name: &str, password: &str) -> Option<Self> {
         let answer = self.try_to_sign_in(name, password);
         let cookie = answer.header("set-cookie").first().copied().filter(|_| answer.status == 303)?.to_owned();
@@ -100,6 +108,7 @@ impl Visitor {
         Some(self)
     }
 
+    /// Sends a name and a password, and returns the response.
     pub fn try_to_sign_in(&self, name: &str, password: &str) -> Answer {
         let escaped = |text: &str| text.bytes().map(|byte| format!("%{byte:02x}")).collect::<String>();
         let body = format!("name={}&password={}", escaped(name), escaped(password));
@@ -113,6 +122,7 @@ impl Visitor {
         self.tls.as_ref().map_or(self.place.clone(), |(_, name)| format!("{name}:{port}"))
     }
 
+    /// Returns the value of the header `Origin`.
     pub fn origin(&self) -> String {
         let scheme = if self.tls.is_some() { "https" } else { "http" };
         format!("{scheme}://{}", self.host())
@@ -125,6 +135,7 @@ impl Visitor {
         }
     }
 
+    /// Gets a page.
     pub fn get(&self, path: &str) -> Answer {
         let (Self { cookies, language, .. }, host) = (self, self.host());
         let request = format!(
@@ -133,6 +144,7 @@ impl Visitor {
         self.ask(request.as_bytes())
     }
 
+    /// Posts a body with additional headers.
     pub fn post(&self, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Answer {
         let (Self { cookies, .. }, host) = (self, self.host());
         let more: String = headers.iter().map(|(name, value)| format!("{name}: {value}\r\n")).collect();
@@ -155,6 +167,7 @@ impl Visitor {
         self.give(&format!("/runs/{run}/orders"), order.to_string().as_bytes())
     }
 
+    /// Takes control of a run. Returns the same as [`Visitor::order`].
     pub fn take_control(&self, run: &str) -> (u16, bool, String) {
         self.give(&format!("/runs/{run}/control"), b"")
     }
