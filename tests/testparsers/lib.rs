@@ -25,7 +25,7 @@ use regrind::formats::{
     read_error_map, references::parse_references,
 };
 use regrind::geometry::{Grid, GridMap, Point};
-use regrind::journal::{Anchor, Reader, canonical_json, verify};
+use regrind::journal::{Anchor, Reader, RecordKind, canonical_json, verify};
 use regrind::recipe::Recipe;
 use regrind::surface::DefinedSurface;
 use regrind_sim::payload;
@@ -326,6 +326,22 @@ pub fn event(bytes: &[u8]) -> bool {
     for line in bytes.split(|&b| b == b'\n') {
         let kinds = [comes_back::<Event>, comes_back::<Command>, comes_back::<Judgement>, comes_back::<Ending>];
         read += usize::from(kinds.map(|comes_back| comes_back(line)).contains(&true));
+    }
+    read > 0
+}
+
+/// Reads each line as the content of a record: its kind, a tab, and its payload. Returns true if at least one line is
+/// valid. Asserts that a content does not change when it is written and read again.
+pub fn content(bytes: &[u8]) -> bool {
+    let mut read = 0;
+    for line in bytes.split(|&b| b == b'\n') {
+        let Some((kind, payload)) = str::from_utf8(line).ok().and_then(|line| line.split_once('\t')) else { continue };
+        let (Ok(kind), Ok(payload)) = (kind.parse::<RecordKind>(), serde_json::from_str(payload)) else { continue };
+        let Ok(content) = regrind::record::Content::from_payload(kind, payload) else { continue };
+        let written = content.payload();
+        let again = regrind::record::Content::from_payload(kind, written.clone());
+        assert_eq!(again.expect("what was written can be read").payload(), written);
+        read += 1;
     }
     read > 0
 }
