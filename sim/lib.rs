@@ -22,7 +22,7 @@
 //!  payload    the bytes of docs/modbus.md
 //!
 //!  body       interface of the physics of one machine
-//!  words      encoding of values in registers
+//!  register_encoding  values in registers
 //!  transfer   payloads in and results out, a page at a time
 //!  command    commands, answers and states as the wire has them
 //!  options    options of a machine, with its register map
@@ -31,9 +31,9 @@
 //!  line_server        what dme and rsh have in common for their wires
 //!  dme        a server of I++ DME, commanded touch by touch
 //!  rsh        a LinuxCNC controller, commanded program by program
-//!  faults     faults of one of these three
+//!  pending_faults     faults of one of these three
 //!  hits       a machine that prints a line for each touch, and receives nothing
-//!  seen       events of the machine
+//!  event_log  events of the machine
 //!  wire       Modbus TCP and RTU, servers of lines, lines of hits, pseudo-terminals, the path of an external controller
 //!
 //!  simulators         the simulator of each protocol, one line each

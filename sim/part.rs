@@ -701,7 +701,7 @@ mod tests {
             for i in -20..=20 {
                 for j in -20..=20 {
                     let at = [about[0] + half * f64::from(i) / 20.0, about[1] + half * f64::from(j) / 20.0];
-                    let r = surface(&part, at);
+                    let r = surface(part, at);
                     let d = (0..3).map(|k| (r[k] - c[k]).powi(2)).sum::<f64>().sqrt();
                     if d < best {
                         (best, middle) = (d, at);

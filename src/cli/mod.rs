@@ -10,6 +10,7 @@ mod completeness;
 mod control;
 mod doctor;
 mod failure;
+mod file_kind;
 mod init;
 mod initial;
 mod key;

@@ -201,7 +201,7 @@ impl RunStart {
     /// first input that is missing, or about another version of the transition table.
     fn from_record(start: PartStart) -> Result<Self, String> {
         fn due<T>(input: Option<T>, name: &str) -> Result<T, String> {
-            input.ok_or_else(|| format!("missing field `{name}`"))
+            input.ok_or_else(|| format!("missing or unreadable field `{name}`"))
         }
         let begun = Self {
             recipe: due(start.recipe, "recipe")?.into(),

@@ -3,10 +3,10 @@
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use regrind::{config, recipe};
-use serde_json::Value;
 
 use super::Outcome;
 use super::failure::Failure;
+use super::file_kind::FileKind;
 use super::plant;
 
 /// Print the JSON schema of recipes, cell files or dialects, for completion in an editor
@@ -21,9 +21,6 @@ pub(super) struct Arguments {
     #[arg(value_parser = of_kind())]
     of: FileKind,
 }
-
-/// Kind of file: its name on the command line, its description, and its JSON schema.
-type FileKind = (&'static str, &'static str, fn() -> &'static Value);
 
 const KINDS: [FileKind; 3] = [
     ("recipe", "Recipes", recipe::json_schema),

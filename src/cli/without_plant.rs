@@ -26,7 +26,7 @@ pub(super) fn run(command: &Commands) -> Result<Outcome, Failure> {
 }
 
 /// Kind of file of a plant: none.
-pub(super) const FILE_KIND: Option<(&str, &str, fn() -> &'static Value)> = None;
+pub(super) const FILE_KIND: Option<super::file_kind::FileKind> = None;
 
 /// Arguments of `regrind run` about the plant: none.
 #[derive(Args, Debug)]

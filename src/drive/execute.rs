@@ -14,7 +14,7 @@ use super::task::ComputationProduct;
 use crate::cell::{Actor, Command, ComparedFigure, Device, Ending, Event, Judgement, RecordFailure};
 use crate::device::BatchId;
 use crate::formats::run_files::{CycleFile, CycleFolder, RunFile};
-use crate::journal::{self};
+use crate::journal;
 
 impl Drive {
     pub(super) async fn execute(&mut self, command: Command) {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::Drive;
 use super::notice::Notice;
 use super::pass_record;
-use super::recorder::{self};
+use super::recorder;
 use super::station::{FetchedResult, MachineNotes, StationReport};
 use crate::cell::Event;
 use crate::device::{BatchId, Identified, Job, Measurement, PassRecord, PreliminaryPoints};

@@ -1,4 +1,5 @@
-//! Computations between a measurement and the next pass: plan, gates, registration, map, correction.
+//! Computations between a measurement and the next pass: gates, figures, correction and learned state. The evaluation
+//! of a measurement is in `evaluation.rs`.
 //!
 //! All functions here block and run off the asynchronous threads. They share their inputs. They return the event for
 //! the cell and write the files of the run folder.

@@ -167,7 +167,12 @@ impl<'t> Replay<'t> {
     fn apply_record(&mut self, record: &Record) -> Result<(), ReplayError> {
         self.last_sequence = record.seq;
         self.replayed.elapsed = self.replayed.elapsed.max(Duration::from_nanos(record.mono_ns));
-        let content = Content::read(record).map_err(|error| self.unreadable(&error))?;
+        let content = match Content::read(record) {
+            Ok(content) => content,
+            Err(error) if decides(record) => return Err(self.unreadable(&error)),
+            // An outcome closes its command, whatever its words. Other notes decide nothing.
+            Err(_) => Content::Unknown(record.value()),
+        };
         match content {
             // Decisions that the program had not recorded when it ended were not executed.
             Content::Reopen(_) => self.due_commands.clear(),
@@ -181,6 +186,7 @@ impl<'t> Replay<'t> {
             }
             Content::Answer(_) => self.close_command(record),
             Content::Unknown(_) if record.kind == RecordKind::Outcome => self.close_command(record),
+            Content::Unknown(_) if record.kind == RecordKind::Reopen => self.due_commands.clear(),
             Content::Begin(_)
             | Content::Recovery(_)
             | Content::Confirmation(_)
@@ -483,5 +489,18 @@ impl<'t> Replay<'t> {
 
     fn differs(&self, what: String) -> ReplayError {
         ReplayError::Differs { run: self.run_folder.to_owned(), seq: self.last_sequence, what }
+    }
+}
+
+/// Returns true if the replay depends on the content of a record: it is an event, a file, a command or the transfer of a
+/// measurement.
+fn decides(record: &Record) -> bool {
+    match record.kind {
+        RecordKind::Event | RecordKind::Artefact => true,
+        RecordKind::Intent | RecordKind::Note => {
+            let payload = record.value();
+            ["command", "transfer"].iter().any(|key| payload.get(*key).is_some())
+        }
+        RecordKind::Begin | RecordKind::Reopen | RecordKind::Outcome | RecordKind::Seal | RecordKind::End => false,
     }
 }

@@ -95,8 +95,13 @@ impl Reopen {
 
 /// Reads the payload of a record. Returns `None` if it is not a JSON object, or lacks a field that `T` requires. serde
 /// alone would also read a struct from a list.
-pub(super) fn read_object<T: DeserializeOwned>(record: &Record) -> Option<T> {
+fn read_object<T: DeserializeOwned>(record: &Record) -> Option<T> {
     Some(record.value()).filter(Value::is_object).and_then(|value| serde_json::from_value(value).ok())
+}
+
+/// Reads the payload of a record, which must be a JSON object in which no field of `T` stands twice.
+pub(super) fn read_unique<T: DeserializeOwned>(record: &Record) -> Option<T> {
+    if record.value().is_object() { serde_json::from_str(&record.payload).ok() } else { None }
 }
 
 /// Deserializes a field. The result is `None` if the field has another type.

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::artefact::{Artefact, describe, path_within, temporary_name};
-use super::content::{Begin, KeyField, Reopen, read_object};
+use super::content::{Begin, KeyField, Reopen, read_unique};
 use super::error::JournalError;
 use super::key::PublicKey;
 use super::names::{ANCHOR, DATABASE, LOCK};
@@ -367,7 +367,7 @@ impl<'a> VerifierState<'a> {
 
     fn check_seal(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: &str| Err(broken(self.folder, record.seq, what));
-        let Some(seal) = read_object::<Seal>(record) else { return wrong("it is not a valid seal") };
+        let Some(seal) = read_unique::<Seal>(record) else { return wrong("it is not a valid seal") };
         let Some(key) = self.key.filter(|key| key.to_string() == seal.key) else {
             return wrong("its key is not the one that the run names");
         };
@@ -431,7 +431,7 @@ impl<'a> VerifierState<'a> {
 
     fn check_artefact(&mut self, record: &Record) -> Result<(), JournalError> {
         let wrong = |what: String| Err(broken(self.folder, record.seq, what));
-        let Some(known) = read_object::<Artefact>(record) else {
+        let Some(known) = read_unique::<Artefact>(record) else {
             return wrong("it names no file".to_owned());
         };
         let Ok(path) = path_within(self.folder, &known.name) else {

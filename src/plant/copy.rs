@@ -168,7 +168,7 @@ impl PlantRun {
 
 /// Returns the anchor (the number of records of the journal and the hash of the last one) from the newest seal among
 /// `records`. A seal is a record that signs the records before it. If there is no seal, returns an unsigned anchor of
-/// the last record. Returns `None` if `records` is empty, or if the seal lacks the number or the hash.
+/// the last record. Returns `None` if `records` is empty, or if the seal cannot be read.
 fn last_sealed(records: &[Record]) -> Option<Anchor> {
     let Some(seal) = records.iter().rev().find(|record| record.kind == RecordKind::Seal) else {
         return records.last().map(|last| Anchor::new(last.seq, last.hash.clone()));

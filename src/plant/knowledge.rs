@@ -17,6 +17,8 @@ use super::error::{PlantError, refused};
 use super::link::DatabaseLink;
 use super::settings::ArtefactSettings;
 
+/// Maximum number of results of other cells. The database has the same limit for one query.
+const MAX_RESULTS: usize = 8;
 /// Maximum size of a file of learned results in bytes. The database has the same limit.
 const MAX_BYTES: u64 = 4 << 20;
 
@@ -66,7 +68,9 @@ impl Knowledge {
         let text = "SELECT $1::text, false, cell, run, sha256, content, place FROM lessons($1, $2)";
         // A cell with results of this version and of an earlier one is asked for those of this version.
         for kind in [&kind.id, &kind.earlier] {
-            let rows = link.client().query(text, &[kind, &simulation]).await.map_err(&failed)?;
+            let mut rows = link.client().query(text, &[kind, &simulation]).await.map_err(&failed)?;
+            rows.retain(|row| knowledge.results.iter().all(|(known, _)| known.cell != row.get::<_, String>(2)));
+            rows.truncate(MAX_RESULTS.saturating_sub(knowledge.results.len()));
             let of_kind = knowledge.verify_results(link, artefacts, (rows, simulation)).await?;
             let is_new =
                 |given: &DeliveredResult| knowledge.results.iter().all(|(known, _)| known.cell != given.from.cell);

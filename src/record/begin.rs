@@ -79,7 +79,8 @@ impl RunContent {
 }
 
 /// Data with which the run of a part began. A program needs them to resume the run. A field is `None` if an earlier
-/// version did not write it.
+/// version did not write it, or if it has another type. For `seed`, `rehearsal` and `before`, null has a meaning: a
+/// content where one of them has another type is [`RunContent::Other`].
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct PartStart {
     /// Path of the recipe, from `working_folder`.
@@ -113,7 +114,7 @@ pub struct PartStart {
     #[serde(default, deserialize_with = "or_none")]
     pub job: Option<u32>,
     /// Seed of another simulated part; `None` for the part of the recipe.
-    #[serde(default, deserialize_with = "or_none")]
+    #[serde(default)]
     pub seed: Option<u64>,
     /// Parameters by which the cell decides.
     #[serde(default)]
@@ -125,7 +126,7 @@ pub struct PartStart {
     #[serde(default, deserialize_with = "or_none")]
     pub machines_within: Option<bool>,
     /// True if the run was a rehearsal without a part.
-    #[serde(default, deserialize_with = "or_none")]
+    #[serde(default)]
     pub rehearsal: Option<bool>,
     /// Run from which the first correction was learned.
     #[serde(default, deserialize_with = "or_none")]
@@ -140,7 +141,7 @@ pub struct PartStart {
     #[serde(default, deserialize_with = "or_none")]
     pub number: Option<u64>,
     /// Run before it, as its anchor was when this run began.
-    #[serde(default, deserialize_with = "or_none")]
+    #[serde(default)]
     pub before: Option<PreviousRun>,
 }
 
@@ -156,7 +157,7 @@ pub struct RecoveryStart {
     #[serde(default, deserialize_with = "or_none")]
     pub number: Option<u64>,
     /// Run before it, as its anchor was when this run began.
-    #[serde(default, deserialize_with = "or_none")]
+    #[serde(default)]
     pub before: Option<PreviousRun>,
 }
 

@@ -32,16 +32,6 @@ impl From<RunEnd> for Value {
     }
 }
 
-impl RunEnd {
-    /// Returns how the run of a part ended; `None` for a recovery and for unknown content.
-    pub fn ending(&self) -> Option<&Ending> {
-        match self {
-            Self::Part(PartEnd { ending, .. }) | Self::Bare(ending) => Some(ending),
-            Self::Recovery(_) | Self::Other(_) => None,
-        }
-    }
-}
-
 /// Ending of the run of a part, with the figures of its cycles. It is also the content of `result.json` in the run
 /// folder.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

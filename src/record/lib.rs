@@ -3,7 +3,8 @@
 //!
 //! All writers make the payload of a record from these types, and all readers of this program read payloads by them.
 //! docs/journal.md is the contract for others. A content of an earlier version is read too: its missing keys are
-//! `None`. A content that this version does not know is [`Content::Unknown`], so that nothing is lost.
+//! `None`. A payload without a key that this version knows is [`Content::Unknown`], with its text; a known key with a
+//! value that this version does not know is an error.
 
 mod begin;
 mod content;

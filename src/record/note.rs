@@ -2,6 +2,7 @@
 
 use regrind_cell::Device;
 use regrind_formats::result::Coordinates;
+use regrind_journal::or_none;
 use serde::{Deserialize, Serialize};
 
 /// Confirmation of a person about a machine that cannot report its own state.
@@ -68,26 +69,33 @@ pub struct PassNote {
     pub pass_record: PassFigures,
 }
 
-/// Figures of a pass; each is `None` if the grinder does not report it.
+/// Figures of a pass; each is `None` if the grinder does not report it, or if it cannot be read.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct PassFigures {
     /// Path travelled, in mm.
+    #[serde(deserialize_with = "or_none")]
     pub path_mm: Option<f64>,
     /// Volume removed, in mm³.
+    #[serde(deserialize_with = "or_none")]
     pub removed_mm3: Option<f64>,
     /// Largest depth removed, in mm.
-    #[serde(rename = "deepest_mm")]
+    #[serde(rename = "deepest_mm", deserialize_with = "or_none")]
     pub max_depth_mm: Option<f64>,
     /// Share of the path in the air, 0 to 1.
+    #[serde(deserialize_with = "or_none")]
     pub idle_share: Option<f64>,
     /// Mean spindle load; 1 is full load.
+    #[serde(deserialize_with = "or_none")]
     pub spindle_load: Option<f64>,
     /// Radius of the wheel, in mm.
+    #[serde(deserialize_with = "or_none")]
     pub wheel_radius_mm: Option<f64>,
     /// Temperature of the part, in °C.
+    #[serde(deserialize_with = "or_none")]
     pub temperature_c: Option<f64>,
     /// Duration, in s.
+    #[serde(deserialize_with = "or_none")]
     pub duration_s: Option<f64>,
 }
 

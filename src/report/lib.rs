@@ -6,7 +6,7 @@
 //!  series of (x, y) --------------> ticks ------+-> SVG
 //!  points with deviations --------> colours --------> PLY
 //!
-//!  records of a run -> RecordContent -> words ----------> a line for each record
+//!  records of a run -> Content       -> words ----------> a line for each record
 //!                        +------------> RunHistory -----> the report of the run, HTML with its maps
 //!                                         +-------------> its results for other systems: QIF, Q-DAS ASCII
 //! ```

@@ -1,8 +1,9 @@
 //! Identity of the settings under which a run may start from the results of an earlier run.
 //!
 //! The identity is the hash of a document with a version. The document has names of its own, so that a renamed key of a
-//! recipe or a renamed variant in the program changes no identity. A change of what the document has needs a new
-//! version. [`SettingIdentity::earlier`] is the text that versions up to 0.2 wrote; it is frozen.
+//! recipe or a renamed variant in the program changes no identity. Only the table `[simulation]` is taken as the recipe
+//! has it. A change of what the document has needs a new version. [`SettingIdentity::earlier`] is the text that
+//! versions up to 0.2 wrote; its form is frozen.
 
 use data_encoding::HEXLOWER;
 use serde::Serialize;

@@ -6,7 +6,7 @@
 
 use std::fs;
 use std::io::Write;
-use std::net::TcpStream;
+use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
@@ -96,6 +96,30 @@ fn cell(home: &Path) -> String {
     let changes: Vec<(&str, &str)> = by_account.iter().map(|(from, to)| (*from, to.as_str())).collect();
     fs::write(&path, changed("config/linuxcnc-simulated.toml", &changes)).unwrap();
     path.display().to_string()
+}
+
+/// Returns the shipped cell without LinuxCNC: its controller is simulated too.
+fn simulated_cell(home: &Path) -> String {
+    let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let programs = home.join("programs");
+    fs::create_dir(&programs).unwrap();
+    let changes = [
+        ("executed_path = [\"linuxcnc/executed-path\"]", String::new()),
+        ("port = 5007", format!("port = {free}")),
+        ("/tmp/regrind-linuxcnc/programs", programs.display().to_string()),
+    ];
+    let changes: Vec<(&str, &str)> = changes.iter().map(|(from, to)| (*from, to.as_str())).collect();
+    let path = home.join("cell.toml");
+    fs::write(&path, changed("config/linuxcnc-simulated.toml", &changes)).unwrap();
+    path.display().to_string()
+}
+
+#[test]
+fn part_ground_by_simulated_controller() {
+    let home = tempfile::tempdir().unwrap();
+    let (recipe, cell) = (recipe(home.path(), [10.0, 1.2]), simulated_cell(home.path()));
+    let (code, told, errors) = run(&["run", &recipe, "--cell", &cell, "--runs", "runs"], home.path());
+    assert!(code == 0 && told.contains("SIMULATION  ACCEPTED"), "{code} {told}\n{errors}");
 }
 
 /// Returns the records that the programs wrote while LinuxCNC ran them, in order of their cycles.

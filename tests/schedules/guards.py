@@ -88,7 +88,7 @@ GUARDS = {
     "a lost linuxcncrsh is told as lost": (
         "src/device/linuxcnc/controller.rs", "self.link_error.clone().unwrap_or_else(never)", "self.link_error.clone().filter(|_| false).unwrap_or_else(never)"),
     "a program writes its end behind its motion": (
-        "src/device/linuxcnc/program.rs", "{again}M66 P0 L0\\n{}M2", "{again}M67\\n{}M2"),
+        "src/device/linuxcnc/program.rs", "{again}M66 P0 L0\\n{}M2", "{again}{}M2"),
     "a START of LinuxCNC that was not seen is fenced off": (
         "src/device/linuxcnc/machine/reconcile.rs", "        self.take_control().await?;\n        let fenced", "        let fenced",
         "linuxcnc", "ignored_start_unknown_until_reconcile"),

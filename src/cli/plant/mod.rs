@@ -1,5 +1,5 @@
 //! Commands and arguments of a plant of many cells: its database, and the live values of a cell. The program has them
-//! only with the feature `plant`; `absent.rs` is the twin of this module without it.
+//! only with the feature `plant`; `without_plant.rs` is the twin of this module without it.
 
 mod audit;
 mod cell_monitor;
@@ -24,7 +24,6 @@ mod truth;
 use clap::Subcommand;
 use regrind_live::LiveError;
 use regrind_plant::PlantError;
-use serde_json::Value;
 
 use super::Outcome;
 use super::failure::Failure;
@@ -53,7 +52,7 @@ pub(super) fn run(command: &Commands) -> Result<Outcome, Failure> {
 }
 
 /// Kind of file of a plant: its name on the command line, its description, and its JSON schema.
-pub(super) const FILE_KIND: Option<(&str, &str, fn() -> &'static Value)> =
+pub(super) const FILE_KIND: Option<super::file_kind::FileKind> =
     Some(("plant", "Plant files", regrind::config::plant_schema));
 
 impl From<PlantError> for Failure {

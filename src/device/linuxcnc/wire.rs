@@ -37,7 +37,8 @@ pub struct LinuxcncWire {
     #[schemars(length(min = 1, max = 200), example = "/home/cnc/linuxcnc/nc_files/regrind")]
     pub programs_at_controller: Option<String>,
     /// For a simulated cell: the program, with its arguments, that prints the path that the controller executes. The
-    /// simulated wheel follows this path. The program is relative to this file if its name contains a slash.
+    /// simulated wheel follows this path. The program is relative to this file if its name contains a slash. Default:
+    /// the controller is simulated too.
     #[schemars(length(min = 1, max = 20), example = ["linuxcnc/executed-path"])]
     pub executed_path: Option<Vec<String>>,
     /// Joints that must be homed.
@@ -153,17 +154,11 @@ impl LinuxcncWire {
     ///
     /// These cases are errors:
     ///
-    /// - The key is missing in a simulated cell. The simulated wheel of such a cell follows this path.
     /// - The key exists in a cell that is not simulated.
     /// - The program or an argument in the key is an empty text.
     fn check_path(&self, place: &MachineTable<'_>, document: &mut Document) {
         let key = place.key("wire.executed_path");
         match (place.simulated, &self.executed_path) {
-            (Some(true), None) => {
-                let allowed = "a simulated wheel requires the path that LinuxCNC executes";
-                let remedy = "write the program that prints the executed path into the key `executed_path` (docs/linuxcnc.md), or write `simulated = false`";
-                document.report(&place.key("wire.kind"), "is \"linuxcnc\" in a simulated cell", allowed, remedy);
-            }
             (Some(false), Some(_)) => {
                 let allowed = "only a simulated wheel requires it";
                 document.report(&key, "is set in a cell that is not simulated", allowed, "remove it");

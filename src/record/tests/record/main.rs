@@ -169,7 +169,7 @@ fn contents_of_earlier_versions_are_read() {
     // The ending alone, as a reader has always accepted it.
     let end = json!({ "ending": { "ending": "accepted", "cycle": 2, "reason": "within" } });
     let Content::End(end) = read(RecordKind::End, end) else { panic!() };
-    assert!(matches!(end.ending.ending(), Some(Ending::Accepted { cycle: 2, .. })));
+    assert!(matches!(end.ending, RunEnd::Bare(Ending::Accepted { cycle: 2, .. })));
     // A row of figures that cannot be read costs no other row.
     let row = json!({ "cycle": 1, "pv_um": 2.0, "rms_um": 0.5, "points": 9, "outliers": 0, "level_um": 1.0 });
     let end = json!({ "ending": { "simulation": true, "ending": { "ending": "accepted", "cycle": 2, "reason": "" }, "cycles": [{}, row] } });
@@ -221,12 +221,22 @@ fn unknown_contents_stay_as_they_are_and_false_ones_are_errors() {
         (RecordKind::Note, json!({ "confirmed": "perhaps", "device": "cmm" })),
         (RecordKind::Note, json!({ "confirmed": "still" })),
         (RecordKind::Note, json!({ "transfer": { "points": 1, "seconds": 1.0, "coordinates": "sideways" } })),
-        (RecordKind::Note, json!({ "pass_record": { "path_mm": "far" } })),
+        (RecordKind::Note, json!({ "pass_record": "far" })),
         (RecordKind::Artefact, json!({ "name": "a" })),
         (RecordKind::Seal, json!({})),
     ] {
         assert!(Content::from_payload(kind, payload.clone()).is_err(), "{payload}");
     }
+}
+
+#[test]
+fn unreadable_figure_of_a_pass_costs_no_other() {
+    let Content::Pass(pass) =
+        read(RecordKind::Note, json!({ "pass_record": { "path_mm": "far", "wheel_radius_mm": 12.5 } }))
+    else {
+        panic!()
+    };
+    assert_eq!((pass.pass_record.path_mm, pass.pass_record.wheel_radius_mm), (None, Some(12.5)));
 }
 
 #[test]
