@@ -72,9 +72,6 @@ impl Knowledge {
             rows.retain(|row| knowledge.results.iter().all(|(known, _)| known.cell != row.get::<_, String>(2)));
             rows.truncate(MAX_RESULTS.saturating_sub(knowledge.results.len()));
             let of_kind = knowledge.verify_results(link, artefacts, (rows, simulation)).await?;
-            let is_new =
-                |given: &DeliveredResult| knowledge.results.iter().all(|(known, _)| known.cell != given.from.cell);
-            let of_kind: Vec<DeliveredResult> = of_kind.into_iter().filter(is_new).collect();
             knowledge.results.extend(of_kind.into_iter().map(|given| (given.from, given.learned)));
         }
         if knowledge.results.is_empty() {

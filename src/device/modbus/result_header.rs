@@ -1,4 +1,4 @@
-//! Header of a result.
+//! Header of a result: its identity, its size, and what its records mean. A driver reads it before the records.
 
 /// Maximum size of a result of a measuring machine, in bytes.
 pub(super) const MAX_RESULT_BYTES: u32 = 64 << 20;
