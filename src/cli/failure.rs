@@ -89,7 +89,7 @@ pub(super) enum Failure {
     Journal(JournalError),
     #[error(transparent)]
     Machine(JournalError),
-    #[error("{path}: no control socket can be created there: {source}; give --runs a local folder with a shorter name")]
+    #[error("{path}: no control socket can be created there: {source}; {}", socket_remedy(.source))]
     ControlSocket { path: PathBuf, source: io::Error },
     #[error("{path}: this path contains no run; name the folder of a run")]
     NoRun { path: PathBuf },
@@ -287,5 +287,17 @@ impl Failure {
             }
             _ => Self::Registration { measured, nominal, source, hint },
         }
+    }
+}
+
+/// Returns the remedy for a control socket that could not be created.
+fn socket_remedy(source: &io::Error) -> &'static str {
+    match source.kind() {
+        // The path has more bytes than the address of a socket can hold.
+        io::ErrorKind::InvalidInput => "give --runs a folder with a shorter name",
+        io::ErrorKind::ReadOnlyFilesystem | io::ErrorKind::StorageFull => {
+            "check this disk, or give --runs a folder on another disk"
+        }
+        _ => "give --runs a folder on a local disk in which this user may create a socket",
     }
 }

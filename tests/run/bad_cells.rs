@@ -93,6 +93,8 @@ fn read_only_runs_folder_refused() {
 fn fills_up(command: Command, home: &Path, named: &str, fill: impl FnOnce()) {
     let mut running = Running::new(command);
     let folder = running.folder(home);
+    // Without its control socket, the run ends before it begins.
+    running.until("control socket", |_| folder.join("control.sock").exists().then_some(()));
     fill();
     let words = running.line("what failed", |line| line.starts_with("RECORD"));
     assert!(words.contains(named), "{words}");

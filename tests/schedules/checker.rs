@@ -360,9 +360,12 @@ fn motions(evidence: &Evidence) -> Vec<Motion> {
 }
 
 /// Checks that nothing moves while the cell shows standstill, except a machine that it names as not having confirmed
-/// the end of the safe sequence. Nobody watches for stray motions after the run is over, or in the moment before.
+/// that it is at rest: after an abort, and in a held cell a CMM on I++ DME, which ends the motion that it was told also
+/// if it hears nothing more. Nobody watches for stray motions after the run is over, or in the moment before.
 fn still_where_shown(evidence: &Evidence) -> Result<(), String> {
     let motions = motions(evidence);
+    // Machines on the other wires hold by themselves when they hear nothing.
+    let moves_on_alone = [!evidence.machine_events.is_empty(), false];
     for (k, shown) in evidence.shown.iter().enumerate() {
         let Some(state) = shown.state.filter(|state| STANDS.contains(state)) else { continue };
         let next = evidence.shown.get(k + 1).map(|next| next.at);
@@ -370,7 +373,8 @@ fn still_where_shown(evidence: &Evidence) -> Result<(), String> {
         for motion in &motions {
             let (from, to) =
                 (motion.from.max(shown.at + STANDS_WITHIN), next.map_or(motion.to, |at| motion.to.min(at)));
-            let is_named = state == StateName::Aborted && shown.unconfirmed[motion.machine];
+            let may_be_named = state == StateName::Aborted || moves_on_alone[motion.machine];
+            let is_named = may_be_named && shown.unconfirmed[motion.machine];
             let is_unseen = over && motion.strayed && motion.from + FOUND_WITHIN > shown.at;
             if from < to && !is_named && !is_unseen {
                 let (name, at) = (NAMES[motion.machine], evidence.seconds(from));
