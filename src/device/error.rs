@@ -106,7 +106,7 @@ pub enum DeviceError {
     /// The machine sent a line that has no meaning, or that belongs to no request.
     #[error(
         "{machine} sent a line that cannot be used ({reason}): {line:?}; the line was not used, and the connection was \
-         closed. If this repeats, compare the server's version of I++ DME with docs/ippdme.md"
+         closed. If this repeats, compare the version of the protocol at the machine with the page of this protocol in docs"
     )]
     Unreadable { machine: Arc<str>, line: String, reason: &'static str },
 

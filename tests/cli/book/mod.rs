@@ -1,6 +1,7 @@
 //! Tests of the book in docs/: every command of its pages runs, its screens are compared with the output, its examples
 //! are checked, and its generated parts match the program.
 
+mod extending;
 mod made;
 mod pages;
 mod structure;
