@@ -4,10 +4,10 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
 use std::path::{Component, Path, PathBuf};
 
+use data_encoding::HEXLOWER;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::canonical::hex;
 use super::error::JournalError;
 use super::names::{ANCHOR, DATABASE, LOCK};
 use super::open::sync_folder;
@@ -48,7 +48,7 @@ impl Artefact {
         // Reads at most one byte beyond the recorded length: a file that has grown is not read to its end.
         let file = File::open(&path).map_err(JournalError::file(&path, "reading it"))?;
         file.take(self.bytes + 1).read_to_end(&mut bytes).map_err(JournalError::file(&path, "reading it"))?;
-        let is_same = bytes.len() as u64 == self.bytes && hex(&Sha256::digest(&bytes)) == self.sha256;
+        let is_same = bytes.len() as u64 == self.bytes && HEXLOWER.encode(&Sha256::digest(&bytes)) == self.sha256;
         if is_same { Ok(bytes) } else { Err(JournalError::OtherFile { path }) }
     }
 }
@@ -112,7 +112,7 @@ pub(super) fn describe(path: &Path, name: &str) -> Result<Artefact, JournalError
             Err(error) => return Err(failed(error)),
         }
     }
-    Ok(Artefact { name: name.to_owned(), bytes, sha256: hex(&digest.finalize()) })
+    Ok(Artefact { name: name.to_owned(), bytes, sha256: HEXLOWER.encode(&digest.finalize()) })
 }
 
 /// Flushes a file that another part of the program wrote, and the folder that contains it, to the disk.

@@ -2,6 +2,7 @@
 
 use std::fmt::Write;
 
+use data_encoding::HEXLOWER;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
@@ -63,7 +64,7 @@ pub(super) fn write_string(text: &mut String, string: &str) {
 
 /// Returns the SHA-256 of bytes, in lowercase hexadecimal digits.
 pub fn sha256_hex(bytes: &[u8]) -> String {
-    hex(&Sha256::digest(bytes))
+    HEXLOWER.encode(&Sha256::digest(bytes))
 }
 
 /// Returns the hash of a record: a SHA-256 as 64 lowercase hexadecimal digits. `text` is the JSON text of this record
@@ -74,27 +75,11 @@ pub(super) fn chain(prev_hash: &str, text: &str) -> String {
     for part in [DOMAIN, prev_hash, "\n", text] {
         digest.update(part.as_bytes());
     }
-    hex(&digest.finalize())
+    HEXLOWER.encode(&digest.finalize())
 }
 
 /// Converts `2 N` lowercase hexadecimal digits to `N` bytes. Returns `None` for another number of digits or other
 /// characters. Uppercase digits are rejected, so that each value has only one text.
 pub(super) fn unhex<const N: usize>(digits: &str) -> Option<[u8; N]> {
-    let nibble = |digit: u8| match digit {
-        b'0'..=b'9' => Some(digit - b'0'),
-        b'a'..=b'f' => Some(digit - b'a' + 10),
-        _ => None,
-    };
-    let digits = digits.as_bytes();
-    let mut bytes = [0; N];
-    for (byte, pair) in bytes.iter_mut().zip(digits.chunks_exact(2)) {
-        *byte = nibble(pair[0])? << 4 | nibble(pair[1])?;
-    }
-    (digits.len() == 2 * N).then_some(bytes)
-}
-
-pub(super) fn hex(bytes: &[u8]) -> String {
-    const DIGITS: &[u8; 16] = b"0123456789abcdef";
-    let digit = |nibble: u8| char::from(DIGITS[usize::from(nibble)]);
-    bytes.iter().flat_map(|byte| [digit(byte >> 4), digit(byte & 15)]).collect()
+    HEXLOWER.decode(digits.as_bytes()).ok()?.try_into().ok()
 }

@@ -7,12 +7,13 @@ use std::io::{self, Write};
 use std::path::Path;
 use std::str::FromStr;
 
+use data_encoding::HEXLOWER;
 use ed25519_compact::{KeyPair, Seed, Signature};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use sha2::{Digest, Sha256};
 
-use super::canonical::{hex, unhex};
+use super::canonical::unhex;
 use super::error::JournalError;
 use super::open::sync_folder;
 use super::system;
@@ -32,7 +33,7 @@ impl PublicKey {
     /// Returns the fingerprint of the key, which two people can compare: the first 16 hexadecimal digits of the SHA-256
     /// of the key, in groups of four.
     pub fn fingerprint(&self) -> String {
-        let digits = hex(&Sha256::digest(self.0)[..8]);
+        let digits = HEXLOWER.encode(&Sha256::digest(self.0)[..8]);
         (0..4).map(|k| &digits[4 * k..4 * k + 4]).collect::<Vec<_>>().join(" ")
     }
 
@@ -62,7 +63,7 @@ impl PublicKey {
 
 impl Display for PublicKey {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        f.write_str(&hex(&self.0))
+        f.write_str(&HEXLOWER.encode(&self.0))
     }
 }
 
@@ -126,7 +127,7 @@ impl AuditKey {
     /// The first line of `message` must state the purpose of the message. A signature for one purpose is then not valid
     /// for another purpose.
     pub fn sign(&self, message: &[u8]) -> String {
-        hex(self.pair.sk.sign(message, None).as_ref())
+        HEXLOWER.encode(self.pair.sk.sign(message, None).as_ref())
     }
 
     /// Reads the key from its file.
@@ -184,7 +185,7 @@ impl AuditKey {
 
     fn write(&self, path: &Path) -> io::Result<()> {
         let mut file = system::create_owners_file(path)?;
-        let secret = hex(self.pair.sk.seed().as_ref());
+        let secret = HEXLOWER.encode(self.pair.sk.seed().as_ref());
         write!(file, "{FIRST_LINE}\nsecret = \"{secret}\"\npublic = \"{}\"\n", self.public())?;
         file.sync_all()
     }

@@ -23,6 +23,7 @@ use regrind_sim::body::Kind;
 use regrind_sim::options::MachineOptions;
 use regrind_sim::registers;
 use regrind_sim::wire::Serving;
+use regrind_testutils::python::with_packages;
 use serde_json::Value;
 
 // ---- Python -------------------------------------------------------------------------------------------------------------------------
@@ -34,39 +35,11 @@ fn scripts() -> PathBuf {
 /// Returns a Python with the required packages, installed once.
 fn python() -> &'static Path {
     static PYTHON: OnceLock<Result<PathBuf, String>> = OnceLock::new();
-    PYTHON.get_or_init(find_python).as_deref().unwrap_or_else(|why| panic!("no Python with pymodbus and x3pio: {why}"))
-}
-
-fn find_python() -> Result<PathBuf, String> {
-    if let Some(named) = std::env::var_os("REGRIND_PYTHON") {
-        let named = PathBuf::from(named);
-        return run(Command::new(&named).args(["-c", "import pymodbus, x3pio"])).map(|()| named);
-    }
-    let wanted = std::fs::read_to_string(scripts().join("requirements.txt")).map_err(|error| error.to_string())?;
-    let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join("interop-python");
-    let python = home.join(if cfg!(windows) { "Scripts/python.exe" } else { "bin/python" });
-    let mark = home.join("has");
-    let works = || run(Command::new(&python).args(["-c", "import pymodbus, x3pio"]));
-    if std::fs::read_to_string(&mark).is_ok_and(|has| has == wanted) && works().is_ok() {
-        return Ok(python);
-    }
-    let base = if cfg!(windows) { "python" } else { "python3" };
-    run(Command::new(base).args(["-m", "venv", "--clear"]).arg(&home))?;
-    let list = scripts().join("requirements.txt");
-    // A single network failure must not fail the tests.
-    let mut install = Command::new(&python);
-    install.args(["-m", "pip", "install", "--quiet", "--retries", "10", "--timeout", "60", "-r"]).arg(list);
-    (0..2).find_map(|_| run(&mut install).ok()).map_or_else(|| run(&mut install), Ok)?;
-    std::fs::write(&mark, wanted).map_err(|error| error.to_string())?;
-    Ok(python)
-}
-
-fn run(command: &mut Command) -> Result<(), String> {
-    let done = command.output().map_err(|error| format!("{command:?}: {error}"))?;
-    match done.status.success() {
-        true => Ok(()),
-        false => Err(format!("{command:?}: {}", String::from_utf8_lossy(&done.stderr).trim())),
-    }
+    let found = PYTHON.get_or_init(|| {
+        let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join("interop-python");
+        with_packages("import pymodbus, x3pio", &scripts().join("requirements.txt"), &home)
+    });
+    found.as_deref().unwrap_or_else(|why| panic!("no Python with pymodbus and x3pio: {why}"))
 }
 
 /// Machine in its own process, which ends when this value is dropped.

@@ -10,19 +10,11 @@ use regrind::config::CellConfig;
 use regrind::drive::Task;
 use regrind::recipe::Recipe;
 use regrind::setup;
+use regrind_testcell::rig::changed;
 
 pub struct Setting {
     pub recipe: Recipe,
     pub cell: CellConfig,
-}
-
-fn changed(file: &str, changes: &[(&str, &str)]) -> String {
-    let mut text = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(file)).unwrap();
-    for (from, to) in changes {
-        assert!(text.contains(from), "{file} has no {from:?}");
-        text = text.replacen(from, to, 1);
-    }
-    text
 }
 
 /// Required quality of a part.

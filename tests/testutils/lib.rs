@@ -3,6 +3,7 @@
 
 pub mod data;
 pub mod keep;
+pub mod python;
 pub mod sample;
 
 use std::path::Path;

@@ -9,8 +9,7 @@ use std::sync::OnceLock;
 use serde_json::Value;
 
 use crate::program::{Running, root};
-
-const NEEDED: &str = "import asyncua, pysparkplug";
+use regrind_testutils::python::with_packages;
 
 fn scripts() -> PathBuf {
     root().join("tests/plant/peers")
@@ -20,41 +19,12 @@ fn scripts() -> PathBuf {
 fn python() -> &'static Path {
     static PYTHON: OnceLock<Result<PathBuf, String>> = OnceLock::new();
     PYTHON
-        .get_or_init(find_python)
+        .get_or_init(|| {
+            let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join("live-python");
+            with_packages("import asyncua, pysparkplug", &scripts().join("requirements.txt"), &home)
+        })
         .as_deref()
         .unwrap_or_else(|why| panic!("no Python with asyncua and pysparkplug: {why}"))
-}
-
-fn find_python() -> Result<PathBuf, String> {
-    if let Some(named) = std::env::var_os("REGRIND_PYTHON") {
-        let named = PathBuf::from(named);
-        if done(Command::new(&named).args(["-c", NEEDED])).is_ok() {
-            return Ok(named);
-        }
-    }
-    let list = scripts().join("requirements.txt");
-    let wanted = std::fs::read_to_string(&list).map_err(|error| error.to_string())?;
-    let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join("live-python");
-    let (python, mark) = (home.join("bin/python"), home.join("has"));
-    let works = || done(Command::new(&python).args(["-c", NEEDED]));
-    if std::fs::read_to_string(&mark).is_ok_and(|has| has == wanted) && works().is_ok() {
-        return Ok(python);
-    }
-    done(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&home))?;
-    // A single network failure must not fail the tests.
-    let mut install = Command::new(&python);
-    install.args(["-m", "pip", "install", "--quiet", "--retries", "10", "--timeout", "60", "-r"]).arg(list);
-    (0..2).find_map(|_| done(&mut install).ok()).map_or_else(|| done(&mut install), Ok)?;
-    std::fs::write(&mark, wanted).map_err(|error| error.to_string())?;
-    Ok(python)
-}
-
-fn done(command: &mut Command) -> Result<(), String> {
-    let done = command.output().map_err(|error| format!("{command:?}: {error}"))?;
-    match done.status.success() {
-        true => Ok(()),
-        false => Err(format!("{command:?}: {}", String::from_utf8_lossy(&done.stderr).trim())),
-    }
 }
 
 /// Python program that prints lines of JSON, and reads them.
