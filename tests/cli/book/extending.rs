@@ -65,18 +65,20 @@ fn added_protocol_fits_sources() {
 #[test]
 #[ignore = "builds the program once more: some minutes"]
 fn added_protocol_makes_a_part() {
-    let sources = tempfile::tempdir().unwrap();
-    copy(root(), sources.path());
+    // The same folder each time, so that the results of the last build are replaced.
+    let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join("extending");
+    let sources = home.join("sources");
+    let _ = fs::remove_dir_all(&sources);
+    copy(root(), &sources);
     for block in &page() {
-        make(block, sources.path());
+        make(block, &sources);
     }
-    let target = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), Into::into);
     let typed = page().into_iter().filter(|block| block.is("sh")).map(|block| block.text).collect::<String>();
     assert!(typed.contains("regrind-device") && typed.contains("cargo run -- run"), "{typed}");
     let done = Command::new("sh")
         .args(["-e", "-x", "-c", &typed])
-        .current_dir(sources.path())
-        .env("CARGO_TARGET_DIR", target.join("extending"))
+        .current_dir(&sources)
+        .env("CARGO_TARGET_DIR", home.join("built"))
         .env("REGRIND_KEY", "")
         .output()
         .unwrap();
@@ -84,6 +86,6 @@ fn added_protocol_makes_a_part() {
     println!("{output}\n{}", String::from_utf8_lossy(&done.stderr));
     assert!(done.status.success(), "{}", done.status);
     assert!(output.contains("ACCEPTED"));
-    let schema = fs::read_to_string(sources.path().join("docs/cell.schema.json")).unwrap();
+    let schema = fs::read_to_string(sources.join("docs/cell.schema.json")).unwrap();
     assert!(schema.contains("plain-touch"));
 }
