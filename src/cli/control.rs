@@ -228,7 +228,8 @@ fn status_text(status: &Snapshot, folder: &Path) -> String {
     for waits in status.waits_for.iter().filter(|waits| **waits != status.next) {
         let _ = writeln!(text, "{waits}");
     }
-    let _ = writeln!(text, "next     {}", status.next);
+    // The further lines of a step stand below its first one.
+    let _ = writeln!(text, "next     {}", status.next.replace('\n', "\n         "));
     let serial = if status.serial.is_empty() { String::new() } else { format!(", {}", status.serial) };
     let _ = writeln!(text, "part     {}{serial}, run {}", status.part, folder.display());
     if let Some(tolerance) = status.tolerance.filter(|_| !status.cycles.is_empty()) {

@@ -3,6 +3,7 @@
 use std::fmt;
 
 use regrind_cell::{Alarm, CycleRow, Device, Phase, StateName, Tolerance};
+use regrind_formats::operator_step::OperatorStep;
 use serde::{Deserialize, Serialize};
 
 /// State of a running cell at one time.
@@ -58,6 +59,9 @@ pub struct Snapshot {
     /// Items that a machine waits for, which a person or another program must provide.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub waits_for: Vec<String>,
+    /// Step that a machine asks of a person, if a person operates it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub operator_step: Option<OperatorStep>,
     /// Next step of a person.
     #[serde(default)]
     pub next_step: NextStep,
@@ -104,6 +108,9 @@ pub enum NextStep {
     /// Check that a machine is clear of the part, and confirm it.
     #[expect(missing_docs, reason = "named for what it is")]
     SeeClear { device: Device },
+    /// Do the step that a machine asks for, [`Snapshot::operator_step`].
+    #[expect(missing_docs, reason = "named for what it is")]
+    AtMachine { device: Device },
     /// Provide the item that a machine waits for.
     #[expect(missing_docs, reason = "named for what it is")]
     Bring { what: String },
@@ -139,6 +146,7 @@ impl fmt::Display for NextStep {
                     "check that the {device} is clear of the part; then: regrind confirm clear --machine {name}"
                 );
             }
+            Self::AtMachine { device } => return write!(f, "do what the {device} asks for"),
             Self::Bring { what } => what,
             Self::SeeToAlarm => "remove the cause of the alarm; the cell then continues by itself",
             Self::ClearAlarm => "follow the steps of the alarm; then: regrind resume, or regrind stop",

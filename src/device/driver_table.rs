@@ -17,6 +17,7 @@ use super::{
     PreliminaryPoints, Reconciled, Started, Status,
 };
 use regrind_document::Document;
+use regrind_formats::operator_step::OperatorStep;
 use regrind_formats::result::Coordinates;
 
 macro_rules! drivers {
@@ -214,6 +215,9 @@ macro_rules! machine {
             }
             fn notes(&self) -> Vec<String> {
                 match self { $(Self::$wire(machine) => Machine::notes(machine)),+ }
+            }
+            fn operator_step(&self) -> Option<OperatorStep> {
+                match self { $(Self::$wire(machine) => machine.operator_step()),+ }
             }
             fn restore(&mut self, intended: &Armed) {
                 match self { $(Self::$wire(machine) => machine.restore(intended)),+ }

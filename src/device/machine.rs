@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use super::error::DeviceError;
 use super::handshake::{Armed, Identity, Job, OperatorConfirmation, Reconciled, Started, Status};
 use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan, PreliminaryPoints};
+use regrind_formats::operator_step::OperatorStep;
 
 /// Operations of every machine of a cell, whatever its wire.
 ///
@@ -20,6 +21,12 @@ pub trait Machine: Send {
     /// for, and which files it ignored and why. Returns an empty list if the status of the machine contains everything.
     fn notes(&self) -> Vec<String> {
         Vec::new()
+    }
+
+    /// Returns the step that the machine asks of a person now, if a person operates it. [`Machine::notes`] contains the
+    /// lines of this step. Returns `None` if a person has nothing to do.
+    fn operator_step(&self) -> Option<OperatorStep> {
+        None
     }
 
     /// Opens the connection to the machine and returns the identity that the machine reports. Checks the identity

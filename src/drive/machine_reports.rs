@@ -15,8 +15,8 @@ impl Drive {
     pub(super) async fn handle_report(&mut self, report: StationReport) {
         let StationReport { event, detail, fetched, preliminary, notes, files } = report;
         self.record_files(self.cell.cycle(), recorder::sync_and_hash(&self.context.folder, &files)).await;
-        if let Some(MachineNotes { device, all, new: messages }) = notes {
-            self.machines.notes[device as usize] = all;
+        if let Some(MachineNotes { device, all, new: messages, step }) = notes {
+            (self.machines.notes[device as usize], self.machines.steps[device as usize]) = (all, step);
             self.display.status.send_replace(self.snapshot());
             if !messages.is_empty() {
                 let notes = record::MachineNotes { device, notes: messages.clone() };

@@ -10,6 +10,7 @@ use super::station::{
 };
 use crate::cell::{Command, Device};
 use crate::device::{Armed, Cmm, Grinder, Interrupt};
+use crate::formats::operator_step::OperatorStep;
 use crate::record::StartIntent;
 
 /// Machines of a run: CMM, grinder. Each has a task of its own.
@@ -25,6 +26,8 @@ pub(super) struct Machines {
     pub(super) prepared: [Option<StartIntent>; 2],
     /// Notes of each machine on why it waits, in words.
     pub(super) notes: [Vec<String>; 2],
+    /// Step that each machine asks of a person.
+    pub(super) steps: [Option<OperatorStep>; 2],
     tasks: [JoinHandle<()>; 2],
 }
 
@@ -58,6 +61,7 @@ impl Machines {
             reports: reported,
             prepared,
             notes: [Vec::new(), Vec::new()],
+            steps: [None, None],
             tasks: [cmm, grinder],
         }
     }

@@ -3,18 +3,30 @@
 use regrind_control::{NextStep, PartVerdict, Snapshot};
 
 use super::Drive;
-use crate::cell::{Cell, Phase, State};
+use crate::cell::{Cell, Device, Phase, State};
+use crate::formats::operator_step::{OperatorStep, run_argument};
 
 impl Drive {
     /// Returns the present status of the run for the clients of the control socket: for example the state of the cell,
     /// the progress of the job, the alarms, and the next action of a person.
     pub(super) fn snapshot(&self) -> Snapshot {
         let state = self.cell.state();
+        let step = self.operator_step();
+        let step_lines = step.as_ref().map_or_else(Vec::new, |(device, step)| {
+            step.lines(&device.to_string().to_lowercase(), &run_argument(&self.context.folder))
+        });
         let waits_for: Vec<String> = match state.phase().and_then(Phase::job) {
-            Some((device, _)) => self.machines.notes[device as usize].clone(),
+            Some((device, _)) => {
+                let notes = self.machines.notes[device as usize].iter();
+                notes.filter(|note| !step_lines.contains(note)).cloned().collect()
+            }
             None => Vec::new(),
         };
-        let next_step = next_step(&self.cell, &waits_for);
+        let next_step = next_step(&self.cell, step.as_ref().map(|(device, _)| *device), &waits_for);
+        let next = match &next_step {
+            NextStep::AtMachine { .. } => step_lines.join("\n"),
+            other => other.to_string(),
+        };
         Snapshot {
             simulation: self.task.simulation,
             part: self.task.part.clone(),
@@ -33,17 +45,28 @@ impl Drive {
             tolerance: Some(self.cell.plan().tolerance),
             cycles: self.cycles.rows(&self.cell.plan().tolerance),
             alarms: self.cell.alarms().cloned().collect(),
-            next: next_step.to_string(),
+            next,
             next_step,
+            operator_step: step.map(|(_, step)| step),
             waits_for,
+        }
+    }
+
+    /// Returns the step that a machine asks of a person now, with this machine. While the cell stops, each machine can
+    /// ask for a step; the step of the CMM is then the first one.
+    fn operator_step(&self) -> Option<(Device, OperatorStep)> {
+        let of = |device: Device| Some((device, self.machines.steps[device as usize].clone()?));
+        match self.cell.state().phase().and_then(Phase::job) {
+            Some((device, _)) => of(device),
+            None => Device::BOTH.into_iter().find_map(of),
         }
     }
 }
 
-/// Returns the next action that the cell needs from a person. `waits_for` are the texts in which the machine of the
-/// current job states what it waits for. If no other action is needed, the action is the first of these texts. If there
-/// is also no such text, no action is needed.
-fn next_step(cell: &Cell, waits_for: &[String]) -> NextStep {
+/// Returns the next action that the cell needs from a person. `asks` is the machine that asks a person for a step.
+/// `waits_for` are the texts in which the machine of the current job states what it waits for. If no other action is
+/// needed, the action is the first of these texts. If there is also no such text, no action is needed.
+fn next_step(cell: &Cell, asks: Option<Device>, waits_for: &[String]) -> NextStep {
     if let (State::Execute(_), Some(device)) = (cell.state(), cell.clear_confirmation_device()) {
         return NextStep::SeeClear { device };
     }
@@ -55,8 +78,10 @@ fn next_step(cell: &Cell, waits_for: &[String]) -> NextStep {
         (State::Held(_), ..) if alarms => NextStep::ClearAlarm,
         (State::Held(_), ..) => NextStep::ResumeOrStop,
         (State::Suspended(_), ..) => NextStep::SeeToAlarm,
-        (State::Aborting, ..) => NextStep::KeepAway,
+        // A machine that a person operates has no safe sequence of its own.
+        (State::Aborting, ..) if asks.is_none() => NextStep::KeepAway,
         (State::Stopped | State::Aborted | State::Complete, ..) => NextStep::ReadReport,
+        _ if let Some(device) = asks => NextStep::AtMachine { device },
         (_, _, [first, ..]) => NextStep::Bring { what: first.clone() },
         _ => NextStep::Nothing,
     }

@@ -23,6 +23,7 @@ use tokio::time::{MissedTickBehavior, interval};
 use super::failure::panic_message;
 use crate::cell::{Command, Device, Event};
 use crate::device::{Armed, BatchId, Interrupt, Machine as _, OperatorConfirmation, PreliminaryPoints};
+use crate::formats::operator_step::OperatorStep;
 use crate::record::EventDetail;
 pub(super) use abort_counter::AbortCounter;
 pub(super) use driver::{CmmDriver, FetchedResult, GrinderDriver, MachinePayload, StationDriver};
@@ -48,6 +49,8 @@ pub(super) struct MachineNotes {
     pub(super) all: Vec<String>,
     /// Notes that were not reported before.
     pub(super) new: Vec<String>,
+    /// Step that the machine asks of a person now.
+    pub(super) step: Option<OperatorStep>,
 }
 
 /// Report of a station to the drive: an event or data of a machine, with the details that the journal stores.
@@ -242,7 +245,8 @@ impl<B: StationDriver> MachineTask<B> {
         let changed = self.reported_notes != notes;
         self.reported_notes = notes;
         if changed {
-            let notes = Some(MachineNotes { device: B::DEVICE, all: self.reported_notes.clone(), new });
+            let step = self.driver.machine().operator_step();
+            let notes = Some(MachineNotes { device: B::DEVICE, all: self.reported_notes.clone(), new, step });
             let _ = self.reports.send(StationReport { notes, ..StationReport::default() }).await;
         }
     }

@@ -17,6 +17,7 @@ mod guard;
 mod guarded_server;
 mod history;
 mod live;
+mod operator_step;
 mod orders;
 mod rate;
 mod sessions;
@@ -35,6 +36,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use axum::Router;
+use axum::extract::DefaultBodyLimit;
 use axum::routing::{get, post};
 use tokio::net::TcpListener;
 
@@ -50,6 +52,9 @@ use guard::Guard;
 use history::History;
 use live::RunWatcher;
 use shared::Shared;
+
+/// Maximum size of the file of a measurement that a browser sends.
+const MAX_MEASUREMENT_BYTES: usize = 64 << 20;
 
 impl Page {
     /// Creates the page for the runs in the folder `runs`. `entrance` contains the address and the access rules of the
@@ -92,7 +97,9 @@ fn routes(page: Shared) -> Router {
         .route("/runs/{run}", get(view::run))
         .route("/runs/{run}/events", get(stream::events))
         .route("/runs/{run}/orders", post(orders::order))
+        .route("/runs/{run}/measurement", post(orders::measurement).layer(DefaultBodyLimit::max(MAX_MEASUREMENT_BYTES)))
         .route("/runs/{run}/control", post(orders::take_control))
+        .route("/runs/{run}/step-file", get(operator_step::step_file))
         .route("/runs/{run}/report", get(view::report))
         .route("/runs/{run}/planned", get(shape::planned))
         .route("/runs/{run}/cycles/{cycle}/map", get(shape::map))

@@ -15,6 +15,10 @@ use super::history::History;
 /// Interval between two attempts to connect to the program of a run that does not answer.
 const BETWEEN_TRIES: Duration = Duration::from_secs(1);
 
+/// Time for which a run is watched after the last browser has left. A page that is loaded again finds its status, and
+/// the cell is not asked for a new connection each time.
+const LINGERS: Duration = Duration::from_secs(5);
+
 /// Current knowledge about a run.
 #[derive(Clone, Default)]
 pub(crate) struct ObservedRun {
@@ -33,35 +37,37 @@ impl ObservedRun {
     }
 }
 
+/// Status of each watched run, by the folder of the run.
+type WatchedRuns = Arc<Mutex<HashMap<PathBuf, Sender<ObservedRun>>>>;
+
 pub(crate) struct RunWatcher {
     history: Arc<History>,
-    watched: Mutex<HashMap<PathBuf, Sender<ObservedRun>>>,
+    watched: WatchedRuns,
 }
 
 impl RunWatcher {
     pub(crate) fn new(history: Arc<History>) -> Self {
-        Self { history, watched: Mutex::default() }
+        Self { history, watched: WatchedRuns::default() }
     }
 
     /// Returns a receiver of the current status of the run in `folder` and of its changes. Starts a watcher for this
     /// run if there is none.
     pub(crate) fn subscribe(self: &RunWatcher, folder: &Path) -> Receiver<ObservedRun> {
         let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
-        watched.retain(|_, seen| seen.receiver_count() > 0);
         if let Some(seen) = watched.get(folder) {
             return seen.subscribe();
         }
         let (seen, looked) = tokio::sync::watch::channel(ObservedRun::default());
         watched.insert(folder.to_owned(), seen.clone());
-        tokio::spawn(keep_watching(folder.to_owned(), Arc::clone(&self.history), seen));
+        tokio::spawn(keep_watching(folder.to_owned(), Arc::clone(&self.history), Arc::clone(&self.watched), seen));
         looked
     }
 }
 
 /// Sends the status of the run in `folder` to `seen` whenever it changes. `history` gives access to the records of the
-/// runs. If the program of the run does not answer, reads the record and tries again after a short time. Ends when no
-/// receiver of `seen` is left.
-async fn keep_watching(folder: PathBuf, history: Arc<History>, seen: Sender<ObservedRun>) {
+/// runs. If the program of the run does not answer, reads the record and tries again after a short time. Ends some time
+/// after the last receiver of `seen` is gone, and then removes the run from `watched`.
+async fn keep_watching(folder: PathBuf, history: Arc<History>, watched: WatchedRuns, seen: Sender<ObservedRun>) {
     let watching = async {
         loop {
             // After any end of the connection the program can return, because another program can continue the run.
@@ -77,7 +83,21 @@ async fn keep_watching(folder: PathBuf, history: Arc<History>, seen: Sender<Obse
     };
     tokio::select! {
         () = watching => {}
-        () = seen.closed() => {}
+        () = unwatched(&folder, &watched, &seen) => {}
+    }
+}
+
+/// Returns when no receiver of `seen` has been left for some time. The run in `folder` is then removed from `watched`.
+async fn unwatched(folder: &Path, watched: &WatchedRuns, seen: &Sender<ObservedRun>) {
+    loop {
+        seen.closed().await;
+        tokio::time::sleep(LINGERS).await;
+        // A new receiver subscribes under the same lock.
+        let mut watched = watched.lock().unwrap_or_else(PoisonError::into_inner);
+        if seen.receiver_count() == 0 {
+            watched.remove(folder);
+            return;
+        }
     }
 }
 

@@ -10,12 +10,13 @@ use std::sync::Arc;
 use axum::Extension;
 use axum::Json;
 use axum::body::Bytes;
-use axum::extract::{Path, State};
+use axum::extract::{Path, Query, State};
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use regrind_cell::Role;
 use regrind_control::{OnBehalf, Reply, Request, send_request_on_behalf};
-use serde::Serialize;
+use regrind_formats::UploadedFile;
+use serde::{Deserialize, Serialize};
 use tokio::task::{JoinHandle, spawn_blocking};
 
 use super::guard::{Session, foreign};
@@ -45,10 +46,10 @@ pub(crate) async fn order(
     headers: HeaderMap,
     body: Bytes,
 ) -> Response {
-    if let Some(what) = foreign(&page.guard, &headers, &session) {
-        return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
-    }
-    let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
+    let folder = match from_this_page(&page, &run, &headers, &session).await {
+        Ok(folder) => folder,
+        Err(refused) => return refused,
+    };
     let request = serde_json::from_slice::<Request>(&body).ok();
     // Other requests that the cell understands are for programs and the terminal only.
     let Some((request, name)) = request.and_then(|request| name_of(&request).map(|name| (request, name))) else {
@@ -60,12 +61,8 @@ pub(crate) async fn order(
         )
         .await;
     };
-    if let Some(what) = not_for(&session, name) {
-        return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
-    }
-    if !MAKES_SAFE.contains(&name) && !page.guard.has_control(&session, true) {
-        let message = "another screen has control of the cell; press TAKE CONTROL on this screen first".to_owned();
-        return (StatusCode::CONFLICT, Json(Answer { accepted: false, message })).into_response();
+    if let Err(refused) = permitted(&page, &run, &session, name).await {
+        return refused;
     }
     if name == "resume"
         && let Some(what) = clears_alarm_of_another(&folder, &session).await
@@ -73,6 +70,77 @@ pub(crate) async fn order(
         return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
     }
     answered(give(folder, request, &session).await)
+}
+
+/// Takes the file of a measurement in `body`, and confirms with it that the measurement is done. The name of the file is
+/// in `named`. The machine reads the file and checks it; the response contains what it found. Refuses the file in the
+/// same cases as [`order`] refuses a confirmation.
+pub(crate) async fn measurement(
+    State(page): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(run): Path<String>,
+    Query(NamedFile { name }): Query<NamedFile>,
+    headers: HeaderMap,
+    body: Bytes,
+) -> Response {
+    let folder = match from_this_page(&page, &run, &headers, &session).await {
+        Ok(folder) => folder,
+        Err(refused) => return refused,
+    };
+    if let Err(refused) = permitted(&page, &run, &session, "done").await {
+        return refused;
+    }
+    let stored = spawn_blocking({
+        let folder = folder.clone();
+        move || UploadedFile::store(&folder, &name, &body)
+    });
+    match stored.await {
+        Ok(Ok(file)) => {
+            let request = Request::Done { map: None, file: Some(file.path().to_owned()) };
+            let reply = give(folder, request, &session).await;
+            // The person knows the file by its name.
+            answered(reply.map(|reply| Reply { message: file.without_folder(&reply.message), ..reply }))
+        }
+        Ok(Err(error)) => {
+            let message = error.to_string();
+            (StatusCode::INSUFFICIENT_STORAGE, Json(Answer { accepted: false, message })).into_response()
+        }
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
+}
+
+/// Name of a file that a browser sends.
+#[derive(Deserialize)]
+pub(crate) struct NamedFile {
+    name: String,
+}
+
+/// Checks that a request of the browser of `session` comes from this page, and uses up its token. Returns the folder of
+/// the run named `run`.
+///
+/// # Errors
+/// Returns the response to the browser if the request comes from elsewhere, or if the run does not exist.
+async fn from_this_page(page: &Shared, run: &str, headers: &HeaderMap, session: &Session) -> Result<PathBuf, Response> {
+    if let Some(what) = foreign(&page.guard, headers, session) {
+        return Err(refuse(page, run, what, StatusCode::FORBIDDEN).await);
+    }
+    page.history.folder(run).ok_or_else(|| StatusCode::NOT_FOUND.into_response())
+}
+
+/// Checks whether the browser of `session` may give the order `name`.
+///
+/// # Errors
+/// Returns the response to the browser if the person does not have the right to give the order, or if another browser
+/// has control and the order needs control.
+async fn permitted(page: &Shared, run: &str, session: &Session, name: &str) -> Result<(), Response> {
+    if let Some(what) = not_for(session, name) {
+        return Err(refuse(page, run, what, StatusCode::FORBIDDEN).await);
+    }
+    if !MAKES_SAFE.contains(&name) && !page.guard.has_control(session, true) {
+        let message = "another screen has control of the cell; press TAKE CONTROL on this screen first".to_owned();
+        return Err((StatusCode::CONFLICT, Json(Answer { accepted: false, message })).into_response());
+    }
+    Ok(())
 }
 
 /// Orders that every screen can give, without control.
@@ -89,6 +157,10 @@ fn name_of(request: &Request) -> Option<&'static str> {
         Request::Loaded => Some("loaded"),
         Request::Clear { .. } => Some("clear"),
         Request::Over { .. } => Some("over"),
+        // A browser names no file of this computer: it sends the file itself.
+        Request::Started { map: None } => Some("started"),
+        Request::Done { map: None, file: None } => Some("done"),
+        Request::Still { device: Some(_) } => Some("still"),
         _ => None,
     }
 }

@@ -176,7 +176,55 @@ texts! {
         "Kein Knopf hier ersetzt den Not-Halt der Maschine.",
         "此处任何按钮都不能代替机器的急停。"
     }
+    // Steps of a person at a machine.
+    StepMeasure { "measure the part", "Teil messen", "测量零件" }
+    StepMoveProbeClear { "move the probe clear of the part", "Taster vom Teil wegfahren", "将测头移离零件" }
+    StepBeginPass { "grind the part", "Teil schleifen", "磨削零件" }
+    StepEndPass { "the pass runs", "der Durchgang läuft", "磨削进行中" }
+    StepHold { "hold the machine at its own panel", "Maschine an ihrem Bedienfeld anhalten", "在机床面板上暂停机床" }
+    StepStop { "stop the machine at its own panel", "Maschine an ihrem Bedienfeld beenden", "在机床面板上停止机床" }
+    StepAbort {
+        "stop the machine at its own panel NOW; Regrind cannot stop it",
+        "Maschine SOFORT an ihrem Bedienfeld stoppen; Regrind kann es nicht",
+        "立即在机床面板上停机；Regrind 无法停止它"
+    }
+    CheckFirst { "Check before:", "Vorher prüfen:", "事先检查：" }
+    RightPartClean { "the right part, clean and clamped", "das richtige Teil, sauber und gespannt", "零件正确、清洁且已夹紧" }
+    RightPartClamped { "the right part, clamped", "das richtige Teil, gespannt", "零件正确且已夹紧" }
+    WheelIsClear { "the wheel is clear of the part", "die Scheibe ist frei vom Teil", "砂轮已离开零件" }
+    ProbeIsClear { "the probe is clear of the part", "der Taster ist frei vom Teil", "测头已离开零件" }
+    ProbeFits { "the probe is the one of the plan", "der Taster ist der des Plans", "测头与计划一致" }
+    WheelFits { "wheel and feed are as above", "Scheibe und Vorschub sind wie oben", "砂轮和进给与上述一致" }
+    RequiredPoints { "Points", "Punkte", "测点" }
+    AtLeast { "at least", "mindestens", "至少" }
+    PlanDigits { "Plan", "Plan", "计划" }
+    ProbeRadius { "Probe radius", "Tasterradius", "测头半径" }
+    Program { "Program", "Programm", "程序" }
+    OwnProgram { "your own program", "Ihr eigenes Programm", "您自己的程序" }
+    MapDigits { "Correction map", "Korrekturkarte", "补偿图" }
+    WheelRadius { "Wheel radius", "Scheibenradius", "砂轮半径" }
+    Feed { "Feed", "Vorschub", "进给" }
+    SparkOutPasses { "Spark-out passes", "Ausfunkdurchgänge", "光磨次数" }
+    WhenMeasured {
+        "When the part is measured and the probe is clear of the part:",
+        "Wenn das Teil gemessen und der Taster frei ist:",
+        "测量完成且测头离开零件后："
+    }
+    WhenProbeClear { "When the probe is clear of the part:", "Wenn der Taster frei vom Teil ist:", "测头离开零件后：" }
+    WhenPassBegun { "Begin the pass at the machine. Then:", "Den Durchgang an der Maschine beginnen. Dann:", "在机床上开始磨削。然后：" }
+    WhenPassEnded {
+        "When the pass has ended and the wheel is clear of the part:",
+        "Wenn der Durchgang zu Ende und die Scheibe frei ist:",
+        "磨削结束且砂轮离开零件后："
+    }
+    WhenAtRest { "When the machine is at rest:", "Wenn die Maschine steht:", "机床静止后：" }
+    PassHasBegun { "THE PASS HAS BEGUN", "DURCHGANG HAT BEGONNEN", "磨削已开始" }
+    JobIsDone { "DONE, AND CLEAR OF THE PART", "FERTIG UND FREI VOM TEIL", "完成，且已离开零件" }
+    IsAtRest { "THE MACHINE IS AT REST", "DIE MASCHINE STEHT", "机床已静止" }
+    MeasurementFile { "File of the measurement", "Datei der Messung", "测量文件" }
+    SendMeasurement { "SEND THE MEASUREMENT", "MESSUNG SENDEN", "发送测量结果" }
     // Next actions.
+    DoStep { "Do what this machine asks for:", "Tun, was diese Maschine verlangt:", "按此机床的要求操作：" }
     Nothing { "No action needed.", "Nichts: die Zelle arbeitet selbst.", "无：单元自动运行。" }
     Load {
         "Load the part and clamp it. Check that the wheel and the probe are clear of the part. Then press THE PART IS LOADED.",
@@ -384,6 +432,7 @@ pub(crate) fn next(next: &NextStep, language: Language) -> (String, Option<Devic
     let (text, device) = match next {
         NextStep::Load => (Text::Load, None),
         NextStep::SeeClear { device } => (Text::SeeClear, Some(*device)),
+        NextStep::AtMachine { device } => (Text::DoStep, Some(*device)),
         NextStep::Bring { what } => return (what.clone(), None),
         NextStep::SeeToAlarm => (Text::SeeToAlarm, None),
         NextStep::ClearAlarm => (Text::ClearAlarm, None),

@@ -10,6 +10,7 @@ use data_encoding::HEXLOWER;
 use maud::{DOCTYPE, Markup, html};
 use regrind_cell::{Alarm, Device, Role, StateName, Tolerance};
 use regrind_control::{JobProgress, NextStep, PreviewStatistics, Snapshot};
+use regrind_formats::operator_step::StepConfirmation;
 use regrind_formats::run_files::RunFile;
 use regrind_report::{AlarmHistory, ColourMap, CycleSummary, RunResult, RunSummary};
 use serde::Deserialize;
@@ -21,6 +22,7 @@ use super::chart::chart;
 use super::guard::{Denied, Session, text};
 use super::history::Listed;
 use super::live::{ObservedRun, verdict};
+use super::operator_step;
 use super::shared::Shared;
 use super::subject::PageSubject;
 use super::texts::{self, Language, Text};
@@ -124,6 +126,15 @@ fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static st
         NextStep::Load if has_control => can.push("loaded"),
         NextStep::SeeClear { .. } if has_control => can.push("clear"),
         NextStep::SeeWhetherItStands { .. } if has_control => can.push("over"),
+        NextStep::AtMachine { .. } if has_control => {
+            let confirmation = live.operator_step.as_ref().and_then(|step| step.confirmation);
+            can.extend(confirmation.map(|confirmation| match confirmation {
+                StepConfirmation::Started => "started",
+                StepConfirmation::Done => "done",
+                StepConfirmation::DoneWithFile => "measurement",
+                StepConfirmation::Still => "still",
+            }));
+        }
         _ => {}
     }
     can.retain(|order| session.may(order));
@@ -194,7 +205,12 @@ fn state_symbol(live: &Snapshot) -> (&'static str, &'static str) {
     match live.state {
         S::Aborting | S::Aborted => ("bad", OCTAGON),
         _ if !live.alarms.is_empty() || !live.unconfirmed.is_empty() => ("alarm", TRIANGLE),
-        S::Execute if matches!(live.next_step, NextStep::Load | NextStep::SeeClear { .. } | NextStep::Bring { .. }) => {
+        S::Execute
+            if matches!(
+                live.next_step,
+                NextStep::Load | NextStep::SeeClear { .. } | NextStep::AtMachine { .. } | NextStep::Bring { .. }
+            ) =>
+        {
             ("asks", TRIANGLE)
         }
         S::Execute | S::Starting | S::Unholding | S::Unsuspending | S::Completing => ("runs", PLAY),
@@ -233,6 +249,13 @@ fn next(seen: &ObservedRun, language: Language) -> Markup {
         // For a lost run the banner already says what to do.
         return html! { @if !seen.is_lost() { p .sentence { (say(Text::ReadReport)) } } };
     };
+    if let (NextStep::AtMachine { device }, Some(step)) = (&live.next_step, &live.operator_step) {
+        let run = format!("/runs/{}", in_path(&seen.summary.run));
+        return html! {
+            (operator_step::card(step, *device, &run, language))
+            (waits(live, language))
+        };
+    }
     let (sentence, device) = texts::next(&live.next_step, language);
     let named = device.map(|device| device.to_string().to_lowercase());
     html! {
@@ -252,8 +275,13 @@ fn next(seen: &ObservedRun, language: Language) -> Markup {
             @let (first, device) = texts::on_resume(phase);
             p .first { (say(Text::FirstThing)) " " @if let Some(device) = device { (device) ": " } (say(first)) }
         }
-        @for waits in &live.waits_for { p .quiet { (say(Text::Waits)) ": " (waits) } }
+        (waits(live, language))
     }
+}
+
+/// Returns the HTML of what the machine of the current job waits for.
+fn waits(live: &Snapshot, language: Language) -> Markup {
+    html! { @for waits in &live.waits_for { p .quiet { (Text::Waits.to(language)) ": " (waits) } } }
 }
 
 /// Returns the HTML of the progress of the current job (work of one machine, such as grinding or measuring). The HTML

@@ -64,6 +64,19 @@ fn finished_run_pages() {
     assert_eq!(visitor.get(&format!("/runs/{}/cycles/9/map", ids[0])).status, 404);
 }
 
+/// A page that is loaded again and again asks the cell for one connection, not for more than the cell allows.
+#[test]
+fn reloaded_page_stays_connected() {
+    let home = tempfile::tempdir().unwrap();
+    let mut cell = CellPage::begin(home.path(), 1.0);
+    cell.run.line("grinding", |line| line.contains("grinding"));
+    let visitor = cell.visitor();
+    for load in 0..40 {
+        let shown = visitor.get(&format!("/runs/{}", cell.id)).text();
+        assert!(shown.contains("data-order=\"hold\"") && !shown.contains("banner lost"), "load {load}: {shown}");
+    }
+}
+
 /// Returns the name of a run in an address, as a browser escapes it.
 fn escaped(id: &str) -> String {
     id.bytes().map(|byte| format!("%{byte:02X}")).collect()

@@ -10,6 +10,7 @@ use regrind::journal::{Reader, Record};
 use regrind_sim::payload::{Feature, Map, Pass, Plan, PointRecord, Status, Target};
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
+use regrind_testcell::http::Visitor;
 use regrind_testcell::study::{grind, touch};
 use serde::Deserialize;
 use serde_json::Value;
@@ -176,6 +177,74 @@ fn rehearsal_is_marked_simulation() {
     assert_eq!((&begun["simulation"], &begun["content"]["rehearsal"]), (&Value::Bool(true), &Value::Bool(true)));
     assert!(folder.to_str().unwrap().ends_with("-SIMULATION"));
     assert!(fs::read_to_string(folder.join("report.html")).unwrap().contains(">SIMULATION<"));
+}
+
+/// A person at the page loads, grinds and measures a part: each step with its file comes from the page, and each
+/// confirmation and each measurement goes through it.
+#[test]
+fn manual_part_by_page_alone() {
+    let home = tempfile::tempdir().unwrap();
+    let (recipe, spec) = recipe(home.path());
+    let (recipe, cell) = (recipe.display().to_string(), root().join("config/manual.toml").display().to_string());
+    let mut program = Running::new(regrind(&["run", &recipe, "--cell", &cell, "--part", "SN-7"], home.path()));
+    let folder = program.folder(home.path());
+    let run = folder.file_name().unwrap().to_str().unwrap().to_owned();
+    let mut page = Running::new(regrind(&["serve", "--runs", "runs", "--listen", "127.0.0.1:0"], home.path()));
+    let url = page.line("address of the page", |line| line.starts_with("page "));
+    let visitor = Visitor::with_key(url.trim_start_matches("page").trim());
+    let mut person = Person { home, world: World::new(spec).unwrap(), measured: 0 };
+    assert_eq!(visitor.take_control(&run).0, 200);
+    let order = |order: &str| visitor.order(&run, &serde_json::json!({ "order": order }));
+    let (mut cycle, mut last) = (0, String::new());
+    while !program.is_over() {
+        let shown = visitor.get(&format!("/runs/{run}")).text();
+        // The page follows the cell: the step that was just confirmed can still stand on it.
+        let step = shown.split("data-order=\"").skip(1).map(|rest| rest.split('"').next().unwrap().to_owned());
+        let step = step.filter(|order| ["loaded", "started", "done", "measurement"].contains(&order.as_str()));
+        let step = step.collect::<String>();
+        if std::mem::replace(&mut last, step.clone()) == step {
+            continue;
+        }
+        let offers = |order: &str| shown.contains(&format!("data-order=\"{order}\""));
+        let step_file = || {
+            let answer = visitor.get(&format!("/runs/{run}/step-file"));
+            (answer.status == 200).then_some(answer.body)
+        };
+        if offers("loaded") {
+            assert!(order("loaded").1);
+        } else if offers("started") {
+            cycle += 1;
+            let before = folder.join(format!("cycle-{}", cycle - 1));
+            // The page gives the program of this pass and no other file.
+            assert!(shown.contains("toolpath.ngc"), "{shown}");
+            assert!(step_file().unwrap() == fs::read(before.join("toolpath.ngc")).unwrap());
+            // A pass that has not begun cannot end, and a browser names no file of this computer.
+            assert!(!order("done").1);
+            let named = serde_json::json!({ "order": "done", "file": "/etc/hostname" });
+            assert_eq!(visitor.order(&run, &named).0, 400);
+            assert!(order("started").1);
+            person.grinds(&before.join("correction.csv"), cycle);
+        } else if offers("done") {
+            assert!(order("done").1);
+        } else if offers("measurement") {
+            let plan = step_file().unwrap();
+            let list = person.home.path().join("plan-of-the-page.csv");
+            fs::write(&list, plan).unwrap();
+            let measured = fs::read(person.measures(&list)).unwrap();
+            let (status, accepted, why) = visitor.send_measurement(&run, "half.csv", &measured[..measured.len() / 2]);
+            assert!(status == 200 && !accepted && why.contains("half.csv") && !why.contains("/.uploaded"), "{why}");
+            let (_, accepted, why) = visitor.send_measurement(&run, "whole.csv", &measured);
+            assert!(accepted, "{why}");
+            assert!(fs::read(folder.join(format!("cycle-{cycle}/result.csv"))).unwrap() == measured);
+        }
+    }
+    let (code, errors) = program.end();
+    assert_eq!(code, 0, "{errors}");
+    assert!(cycle > 1 && program.output_lines.iter().any(|line| line.starts_with("ACCEPTED")));
+    // Nothing of what was sent is left beside the record.
+    assert!(!folder.join(".uploaded").exists());
+    let (code, told) = person.types("audit verify");
+    assert_eq!(code, 0, "{told}");
 }
 
 #[test]

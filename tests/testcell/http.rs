@@ -172,6 +172,11 @@ impl Visitor {
         self.give(&format!("/runs/{run}/control"), b"")
     }
 
+    /// Sends the file of a measurement as the page does. Returns the same as [`Visitor::order`].
+    pub fn send_measurement(&self, run: &str, name: &str, bytes: &[u8]) -> (u16, bool, String) {
+        self.give(&format!("/runs/{run}/measurement?name={name}"), bytes)
+    }
+
     fn give(&self, path: &str, body: &[u8]) -> (u16, bool, String) {
         let (origin, token) = (self.origin(), self.token());
         let answer = self.post(path, &[("Origin", &origin), ("X-Regrind-Token", &token)], body);

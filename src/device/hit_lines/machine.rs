@@ -8,7 +8,7 @@
 //!  STOP and ABORT: the person is asked too
 //! ```
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 use data_encoding::HEXLOWER;
@@ -26,6 +26,7 @@ use crate::handshake::{
 use crate::job_memory::JobMemory;
 use crate::machine::{Cmm, Interrupt, Machine};
 use crate::payload::{Identified, Measurement, Plan, PreliminaryPoints};
+use regrind_formats::operator_step::{OperatorAction, OperatorStep, RequiredPoints, StepConfirmation, run_argument};
 use regrind_formats::run_files::{self, CycleFolder};
 use regrind_formats::{FormatError, JsonlAppender, ResultFolder, write_atomic};
 
@@ -84,56 +85,38 @@ impl HitLinesCmm {
         Ok(status_of(&session))
     }
 
-    /// Returns instructions for the operator, one per line: what to do at the machine now, and which `regrind` command
-    /// to type afterwards. `session` is the current measurement session. Returns no lines if no measurement is
-    /// requested, or if the operator has nothing to do in the current state.
-    fn prompt(&self, session: &MeasurementSession) -> Vec<String> {
-        let Some(asked) = &session.measurement else { return Vec::new() };
-        let folder = &self.settings.run_folder;
-        let run = match folder.parent() == Some(Path::new("runs")) {
-            true => String::new(),
-            false => format!(" {}", folder.display()),
+    /// Returns the step that the machine asks of a person now. `session` is the current measurement session. Returns
+    /// `None` if no measurement is requested, or if there is nothing to do.
+    fn step(&self, session: &MeasurementSession) -> Option<OperatorStep> {
+        let asked = session.measurement.as_ref()?;
+        let remaining = Some(session.remaining_targets());
+        // After a pause, the machine ends by itself.
+        let done = self.settings.clear_after.is_none().then_some(StepConfirmation::Done);
+        let (action, confirmation) = match session.state {
+            MachineState::Execute if asked.list.is_complete() => (OperatorAction::MoveProbeClear, Some(done?)),
+            MachineState::Execute => (self.measure(session, asked), done),
+            MachineState::Holding => (OperatorAction::Hold { remaining }, Some(StepConfirmation::Still)),
+            MachineState::Stopping => (OperatorAction::Stop { remaining }, Some(StepConfirmation::Still)),
+            MachineState::Aborting => (OperatorAction::Abort, None),
+            _ => return None,
         };
-        let then = |word: &str| format!("then: regrind confirm {word} --machine cmm{run}");
-        let part = &self.settings.part;
-        let stop = |what: &str| {
-            vec![format!("{what} the machine at its own panel; {}", session.remaining_targets()), then("still")]
-        };
-        match session.state {
-            MachineState::Execute if asked.list.is_complete() => match self.settings.clear_after {
-                None => vec!["every target is touched; when the probe is clear of the part,".to_owned(), then("done")],
-                Some(_) => Vec::new(),
+        Some(OperatorStep { action, confirmation })
+    }
+
+    fn measure(&self, session: &MeasurementSession, asked: &RequestedMeasurement) -> OperatorAction {
+        let points = match (self.settings.min_free_points, asked.list.progress().1) {
+            (Some(least), _) => RequiredPoints::AtLeast(least),
+            (None, count) => RequiredPoints::Listed {
+                count: count.unwrap_or_default(),
+                file: self.settings.run_folder.join(plan_file(asked.job)),
             },
-            MachineState::Execute => {
-                let points = match (self.settings.min_free_points, asked.list.progress().1) {
-                    (Some(least), _) => format!("at least {least} points"),
-                    (None, count) => {
-                        let list = folder.join(plan_file(asked.job));
-                        format!("the {} points of {}", count.unwrap_or_default(), list.display())
-                    }
-                };
-                let mut prompt = vec![
-                    format!(
-                        "MEASURE {part}, cycle {}: {points} (plan {})",
-                        asked.job.batch_id(),
-                        session.plan_digits()
-                    ),
-                    "check: right part, clean, clamped; wheel clear of the part; probe radius as in the plan"
-                        .to_owned(),
-                ];
-                if self.settings.clear_after.is_none() {
-                    prompt.push("when the part is measured and the probe is clear of the part,".to_owned());
-                    prompt.push(then("done"));
-                }
-                prompt
-            }
-            MachineState::Holding => stop("HOLD"),
-            MachineState::Stopping => stop("STOP"),
-            MachineState::Held => vec![format!("{}; to continue: regrind resume", session.remaining_targets())],
-            MachineState::Aborting => {
-                vec!["ABORT: stop the machine at its own panel NOW; Regrind cannot stop the machine".to_owned()]
-            }
-            _ => Vec::new(),
+        };
+        OperatorAction::Measure {
+            part: self.settings.part.clone(),
+            cycle: asked.job.batch_id().to_string(),
+            points,
+            plan: Some(session.plan_digits()),
+            probe_radius_mm: None,
         }
     }
 
@@ -242,7 +225,15 @@ impl Machine for HitLinesCmm {
 
     fn notes(&self) -> Vec<String> {
         let session = locked(&self.session);
-        session.refusals().into_iter().chain(self.prompt(&session)).collect()
+        let run = run_argument(&self.settings.run_folder);
+        let step = self.step(&session).map_or_else(Vec::new, |step| step.lines(MachineKind::Cmm.name(), &run));
+        let held = (session.state == MachineState::Held && session.measurement.is_some())
+            .then(|| format!("{}; to continue: regrind resume", session.remaining_targets()));
+        session.refusals().into_iter().chain(step).chain(held).collect()
+    }
+
+    fn operator_step(&self) -> Option<OperatorStep> {
+        self.step(&locked(&self.session))
     }
 
     async fn connect(&mut self) -> DeviceResult<Identity> {

@@ -27,6 +27,7 @@ use super::{
     Job, Machine, MachineCommand, MachineKind, MachineState, Measurement, OperatorConfirmation, Outcome, Pass,
     PassRecord, Plan, Reconciled, Started, Status, digest,
 };
+use regrind_formats::operator_step::{OperatorAction, OperatorStep, RequiredPoints, StepConfirmation, run_argument};
 use regrind_formats::result::{Content, read_bytes};
 use regrind_formats::run_files::{
     CycleFile, CycleFolder, is_machine_result_file, is_tool_path_file, machine_result_file, plan_file,
@@ -149,76 +150,57 @@ impl ManualMachine {
 
     // ---- what a person is asked ---------------------------------------------------------------------------------------------------
 
-    /// Returns the present instructions for the operator, one per line: what to do and check at the machine, and which
-    /// `regrind confirm` command to type after that. Returns an empty list if the operator has nothing to do.
-    fn prompt(&self) -> Vec<String> {
-        let Some((job, _)) = self.job else { return Vec::new() };
-        let name = self.kind.name();
-        let confirm = |what: &str| format!("then: regrind confirm {what}{}", self.run_argument());
-        let still = |what: &str| {
-            vec![format!("{what} the machine at its own panel"), confirm(&format!("still --machine {name}"))]
-        };
-        match (self.state, &self.task) {
+    /// Returns the step that the machine asks of a person now. Returns `None` if there is nothing to do.
+    fn step(&self) -> Option<OperatorStep> {
+        let (job, _) = self.job?;
+        let (action, confirmation) = match (self.state, &self.task) {
             (MachineState::Execute, Some((ManualTask::Measure(plan), _))) => {
-                self.prompt_to_measure(job, plan, &confirm)
+                (self.measure(job, plan), Some(StepConfirmation::DoneWithFile))
+            }
+            (MachineState::Execute, Some((ManualTask::Grind(..), _))) if self.started_at.is_some() => {
+                (OperatorAction::EndPass, Some(StepConfirmation::Done))
             }
             (MachineState::Execute, Some((ManualTask::Grind(pass, map), _))) => {
-                self.prompt_to_grind(job, pass, map, &confirm)
+                (self.begin_pass(job, pass, map), Some(StepConfirmation::Started))
             }
-            (MachineState::Holding, _) => still("HOLD"),
-            (MachineState::Stopping, _) => still("STOP"),
-            (MachineState::Aborting, _) => {
-                vec!["ABORT: stop the machine at its own panel NOW; Regrind cannot stop the machine".to_owned()]
-            }
-            _ => Vec::new(),
-        }
-    }
-
-    fn prompt_to_measure(&self, job: Job, plan: &Plan, confirm: &dyn Fn(&str) -> String) -> Vec<String> {
-        let (part, file) = (&self.settings.part, self.cycle_folder(job).join(plan_file(job.batch_id().batch)));
-        let points = match self.settings.min_free_points {
-            Some(least) => format!("at least {least} points"),
-            None => format!("{} points of {}", plan.targets.len(), file.display()),
+            (MachineState::Holding, _) => (OperatorAction::Hold { remaining: None }, Some(StepConfirmation::Still)),
+            (MachineState::Stopping, _) => (OperatorAction::Stop { remaining: None }, Some(StepConfirmation::Still)),
+            (MachineState::Aborting, _) => (OperatorAction::Abort, None),
+            _ => return None,
         };
-        vec![
-            format!("MEASURE {part}, cycle {}: {points}", job.batch_id()),
-            format!(
-                "check: right part, clean, clamped; wheel clear of the part; probe radius {} mm",
-                plan.probe_radius_mm
-            ),
-            "when the part is measured and the probe is clear of the part,".to_owned(),
-            confirm("done --file RESULT"),
-        ]
+        Some(OperatorStep { action, confirmation })
     }
 
-    fn prompt_to_grind(&self, job: Job, pass: &Pass, map: &[u8; 32], confirm: &dyn Fn(&str) -> String) -> Vec<String> {
-        if self.started_at.is_some() {
-            let ended = "when the pass has ended and the wheel is clear of the part,".to_owned();
-            return vec![ended, confirm("done")];
+    fn measure(&self, job: Job, plan: &Plan) -> OperatorAction {
+        let batch = job.batch_id();
+        let points = match self.settings.min_free_points {
+            Some(least) => RequiredPoints::AtLeast(least),
+            None => RequiredPoints::Listed {
+                count: plan.targets.len(),
+                file: self.cycle_folder(job).join(plan_file(batch.batch)),
+            },
+        };
+        OperatorAction::Measure {
+            part: self.settings.part.clone(),
+            cycle: batch.to_string(),
+            points,
+            plan: None,
+            probe_radius_mm: Some(plan.probe_radius_mm),
         }
-        let folder = self.cycle_folder(Job { cycle: job.cycle.saturating_sub(1), ..job });
-        let there = find_program(&folder)
-            .or_else(|| Some(folder.join(CycleFile::Correction.name())).filter(|file| file.is_file()));
-        let by = there.map_or("your own program".to_owned(), |file| file.display().to_string());
-        let map = HEXLOWER.encode(&map[..4]);
-        vec![
-            format!("GRIND {}, cycle {}: with {by} (map {map})", self.settings.part, job.cycle),
-            format!(
-                "check: right part, clamped; probe clear of the part; wheel radius {} mm, feed {} mm/min, {} spark-out \
-                 passes",
-                pass.wheel_radius_mm, pass.feed_mm_min, pass.spark_out_passes
-            ),
-            "begin the pass,".to_owned(),
-            confirm("started"),
-        ]
     }
 
-    /// Returns the path of the run folder as an argument for the command `regrind confirm`, with a blank before it.
-    /// Returns an empty text if the run folder is directly in `runs`, because then the command finds the newest run
-    /// without the argument.
-    fn run_argument(&self) -> String {
-        let folder = &self.settings.run_folder;
-        if folder.parent() == Some(Path::new("runs")) { String::new() } else { format!(" {}", folder.display()) }
+    fn begin_pass(&self, job: Job, pass: &Pass, map: &[u8; 32]) -> OperatorAction {
+        let folder = self.cycle_folder(Job { cycle: job.cycle.saturating_sub(1), ..job });
+        let correction = || Some(folder.join(CycleFile::Correction.name())).filter(|file| file.is_file());
+        OperatorAction::BeginPass {
+            part: self.settings.part.clone(),
+            cycle: job.cycle.into(),
+            program: find_program(&folder).or_else(correction),
+            map: HEXLOWER.encode(&map[..4]),
+            wheel_radius_mm: pass.wheel_radius_mm,
+            feed_mm_min: pass.feed_mm_min,
+            spark_out_passes: pass.spark_out_passes,
+        }
     }
 
     fn cycle_folder(&self, job: Job) -> PathBuf {
@@ -381,7 +363,12 @@ impl Machine for ManualMachine {
     }
 
     fn notes(&self) -> Vec<String> {
-        self.prompt()
+        let run = run_argument(&self.settings.run_folder);
+        self.step().map_or_else(Vec::new, |step| step.lines(self.kind.name(), &run))
+    }
+
+    fn operator_step(&self) -> Option<OperatorStep> {
+        self.step()
     }
 
     async fn connect(&mut self) -> DeviceResult<Identity> {

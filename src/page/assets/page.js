@@ -60,7 +60,9 @@
   function replace(holder, html) {
     const focused = holder.contains(document.activeElement) ? document.activeElement.dataset.order || document.activeElement.id : null;
     const typed = element("evidence") && holder.contains(element("evidence")) ? element("evidence").value : null;
+    const chosen = element("result-file") && holder.contains(element("result-file")) ? element("result-file") : null;
     holder.innerHTML = html;
+    if (chosen && element("result-file")) element("result-file").replaceWith(chosen);
     if (typed !== null && element("evidence")) element("evidence").value = typed;
     if (focused) (holder.querySelector(`[data-order="${focused}"]`) || element(focused) || holder).focus?.();
   }
@@ -103,6 +105,9 @@
     abort: () => ({ order: "abort", reason: "" }),
     loaded: () => ({ order: "loaded" }),
     clear: (button) => ({ order: "clear", device: button.dataset.device }),
+    started: () => ({ order: "started" }),
+    done: () => ({ order: "done" }),
+    still: (button) => ({ order: "still", device: button.dataset.device }),
     over: (button) => ({ order: "over", device: button.dataset.device, evidence: element("evidence").value.trim() }),
   };
 
@@ -114,8 +119,14 @@
       element("evidence").focus();
       return;
     }
-    const url = order === "control" ? `${base}/control` : `${base}/orders`;
-    const body = order === "control" ? "" : JSON.stringify(bodies[order](button));
+    const file = order === "measurement" ? element("result-file").files[0] : null;
+    if (order === "measurement" && !file) {
+      element("result-file").focus();
+      return;
+    }
+    const urls = { control: `${base}/control`, measurement: file && `${base}/measurement?name=${encodeURIComponent(file.name)}` };
+    const url = urls[order] || `${base}/orders`;
+    const body = file || (order === "control" ? "" : JSON.stringify(bodies[order](button)));
     try {
       const answer = await regrindPost(url, body);
       const { accepted, message } = await answer.json();
