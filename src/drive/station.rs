@@ -82,6 +82,8 @@ pub(super) struct MachineTask<B> {
     observed: ObservedState,
     /// Notes that were last reported to a person.
     reported_notes: Vec<String>,
+    /// Step of a person that was last reported.
+    reported_step: Option<OperatorStep>,
 }
 
 impl<B: StationDriver> MachineTask<B> {
@@ -107,6 +109,7 @@ impl<B: StationDriver> MachineTask<B> {
             cycle,
             observed: seen,
             reported_notes: notes,
+            reported_step: None,
         }
     }
 
@@ -240,12 +243,11 @@ impl<B: StationDriver> MachineTask<B> {
     /// Sends the texts in which the machine informs people (for example why it waits) to the drive, if they have
     /// changed since the last report.
     async fn report_notes(&mut self) {
-        let notes = self.driver.machine().notes();
+        let (notes, step) = (self.driver.machine().notes(), self.driver.machine().operator_step());
         let new: Vec<String> = notes.iter().filter(|message| !self.reported_notes.contains(message)).cloned().collect();
-        let changed = self.reported_notes != notes;
-        self.reported_notes = notes;
+        let changed = self.reported_notes != notes || self.reported_step != step;
+        (self.reported_notes, self.reported_step) = (notes, step.clone());
         if changed {
-            let step = self.driver.machine().operator_step();
             let notes = Some(MachineNotes { device: B::DEVICE, all: self.reported_notes.clone(), new, step });
             let _ = self.reports.send(StationReport { notes, ..StationReport::default() }).await;
         }

@@ -16,6 +16,9 @@ pub struct OperatorStep {
     /// the run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub confirmation: Option<StepConfirmation>,
+    /// First digits of the identity of the map that the confirmation must name, if it must name one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub named_map: Option<String>,
 }
 
 /// Action of a person at a machine.
@@ -117,7 +120,8 @@ impl OperatorStep {
         lines.extend(self.action.checks().map(|checks| format!("check: {checks}")));
         if let Some(confirmation) = self.confirmation {
             lines.extend(self.action.before_confirmation().map(str::to_owned));
-            lines.push(format!("then: regrind confirm {}{run}", confirmation.arguments(machine)));
+            let map = self.named_map.as_ref().map_or_else(String::new, |map| format!(" --map {map}"));
+            lines.push(format!("then: regrind confirm {}{map}{run}", confirmation.arguments(machine)));
         }
         lines
     }
@@ -215,7 +219,7 @@ mod tests {
             feed_mm_min: 3000.0,
             spark_out_passes: 1,
         };
-        OperatorStep { action, confirmation: Some(StepConfirmation::Started) }
+        OperatorStep { action, confirmation: Some(StepConfirmation::Started), named_map: None }
     }
 
     #[test]
@@ -225,9 +229,12 @@ mod tests {
         assert!(lines[0].contains("mirror, cycle 2") && lines[0].contains("3fa9c210"), "{lines:?}");
         assert!(lines[1].starts_with("check: ") && lines[1].contains("20 mm"), "{lines:?}");
         assert_eq!(lines[3], "then: regrind confirm started runs/x");
+        let named = OperatorStep { named_map: Some("3fa9c210".into()), ..begin_pass() };
+        assert_eq!(named.lines("grinder", "")[3], "then: regrind confirm started --map 3fa9c210");
         let hold = OperatorStep {
             action: OperatorAction::Hold { remaining: Some("3 targets remain".into()) },
             confirmation: Some(StepConfirmation::Still),
+            named_map: None,
         };
         let lines = hold.lines("cmm", "");
         assert!(lines[0].ends_with("; 3 targets remain"), "{lines:?}");
@@ -248,7 +255,7 @@ mod tests {
 
     #[test]
     fn step_serializes_and_parses() {
-        let abort = OperatorStep { action: OperatorAction::Abort, confirmation: None };
+        let abort = OperatorStep { action: OperatorAction::Abort, confirmation: None, named_map: None };
         let text = serde_json::to_string(&abort).unwrap();
         assert_eq!(text, r#"{"action":"abort"}"#);
         for step in [abort, begin_pass()] {

@@ -1,8 +1,9 @@
 //! Names of the files in the folder of a run. The journal itself names its files.
 
+use std::ffi::OsStr;
 use std::fmt;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Defines files, each with its name.
 macro_rules! named_files {
@@ -158,6 +159,15 @@ pub fn is_tool_path_file(name: &str) -> bool {
     name.strip_prefix(TOOL_PATH).is_some_and(|rest| rest.starts_with('.'))
 }
 
+/// Returns the path of the program for the pass of the cycle `cycle` in the run folder `run`. The cycle before wrote it.
+/// Returns `None` if there is no program.
+pub fn program_for_pass(run: &Path, cycle: u32) -> Option<PathBuf> {
+    let folder = run.join(CycleFolder::new(cycle.saturating_sub(1)).to_string());
+    let files = fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
+    let is_program = |name: Option<&OsStr>| name.and_then(OsStr::to_str).is_some_and(is_tool_path_file);
+    files.filter(|file| file.is_file() && is_program(file.file_name())).min()
+}
+
 /// Returns the name of the list of targets for a person or a machine that touches them. `earlier_batches` is the number
 /// of batches of touches before it in the same measurement.
 pub fn plan_file(earlier_batches: u32) -> String {
@@ -233,6 +243,18 @@ mod tests {
             assert_eq!(CycleFolder::cycle_of(&format!("{path}/measured.csv")), Some(cycle));
         }
         assert_eq!(["recipe.toml", "cycle-x/a", "a/cycle-1"].map(CycleFolder::cycle_of), [None; 3]);
+    }
+
+    #[test]
+    fn program_for_pass_from_cycle_before() {
+        let home = tempfile::tempdir().unwrap();
+        assert_eq!(program_for_pass(home.path(), 1), None);
+        fs::create_dir(home.path().join("cycle-1")).unwrap();
+        for name in ["toolpath_z.csv", "toolpath.ngc", "correction.csv"] {
+            fs::write(home.path().join("cycle-1").join(name), "").unwrap();
+        }
+        assert_eq!(program_for_pass(home.path(), 2), Some(home.path().join("cycle-1/toolpath.ngc")));
+        assert_eq!(program_for_pass(home.path(), 3), None);
     }
 
     #[test]

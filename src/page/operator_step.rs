@@ -32,8 +32,8 @@ pub(crate) fn card(step: &OperatorStep, device: Device, run: &str, language: Lan
             @if let Some(confirmation) = step.confirmation {
                 p { (say(before_confirmation(&step.action))) }
                 @match confirmation {
-                    StepConfirmation::Started => { button type="button" data-order="started" { (say(Text::PassHasBegun)) } }
-                    StepConfirmation::Done => { button type="button" data-order="done" { (say(Text::JobIsDone)) } }
+                    StepConfirmation::Started => { button type="button" data-order="started" data-map=[&step.named_map] { (say(Text::PassHasBegun)) } }
+                    StepConfirmation::Done => { button type="button" data-order="done" data-map=[&step.named_map] { (say(Text::JobIsDone)) } }
                     StepConfirmation::DoneWithFile => {
                         label { (say(Text::MeasurementFile)) input id="result-file" type="file"; }
                         button type="button" data-order="measurement" { (say(Text::SendMeasurement)) }
@@ -132,9 +132,10 @@ pub(crate) async fn step_file(State(page): State<Shared>, Path(run): Path<String
             OperatorAction::BeginPass { program, .. } => program?,
             _ => return None,
         };
-        // The file lies in a cycle folder of this run, under the name that the step states.
-        let (name, cycle) = (path.file_name()?.to_owned(), path.parent()?.file_name()?.to_owned());
-        let bytes = regrind_formats::result::read_bytes(&folder.join(cycle).join(&name)).ok()?;
+        let (name, holder) = (path.file_name()?.to_owned(), path.parent()?.file_name()?.to_owned());
+        // A file of this run lies in the folder of a cycle; the program of the run may name it from another folder.
+        let in_run = folder.join(holder).join(&name);
+        let bytes = regrind_formats::result::read_bytes(if in_run.is_file() { &in_run } else { &path }).ok()?;
         Some((name.to_string_lossy().into_owned(), bytes))
     });
     match read.await {

@@ -158,8 +158,8 @@ fn name_of(request: &Request) -> Option<&'static str> {
         Request::Clear { .. } => Some("clear"),
         Request::Over { .. } => Some("over"),
         // A browser names no file of this computer: it sends the file itself.
-        Request::Started { map: None } => Some("started"),
-        Request::Done { map: None, file: None } => Some("done"),
+        Request::Started { .. } => Some("started"),
+        Request::Done { file: None, .. } => Some("done"),
         Request::Still { device: Some(_) } => Some("still"),
         _ => None,
     }

@@ -17,6 +17,7 @@ use regrind::device::{
     digest,
 };
 use regrind::formats::FormatError;
+use regrind::formats::operator_step::OperatorStep;
 use regrind::geometry::Grid;
 use tokio::sync::oneshot;
 
@@ -49,7 +50,13 @@ impl Shop {
 
     fn grinder(&self, stable_for: Duration) -> GrinderFolders {
         let (outbox, inbox) = (self.outbox.clone(), self.inbox.clone());
-        GrinderFolders::new(GrinderExchange { part: "SN 7".into(), outbox, inbox, stable_for })
+        GrinderFolders::new(GrinderExchange {
+            part: "SN 7".into(),
+            outbox,
+            inbox,
+            run_folder: PathBuf::new(),
+            stable_for,
+        })
     }
 
     /// Writes a file. Each is a second newer than the one before, independent of the resolution of the disk's clock.
@@ -491,6 +498,8 @@ fn pass_confirmed_by_map_identity() {
     let map_identity = map().identity();
     let job = Job { job: 3, cycle: 2, digest: digest(&[map_identity, pass().identity()]) };
     shop.put("done.json", "{}");
+    // The confirmation of an earlier pass is no news.
+    shop.put("started.json", &format!("{{\"map\": \"{}\", \"job\": 3, \"cycle\": 1}}", "0a".repeat(32)));
     grinder.publish(job, 4, &GrindOrder { map: map(), pass: pass(), map_identity }, &Permit::new()).unwrap();
     let folder = shop.outbox.join("SN_7_j3_c2");
     let csv = fs::read_to_string(folder.join("correction.csv")).unwrap();
@@ -503,6 +512,7 @@ fn pass_confirmed_by_map_identity() {
     };
     let look = settled(&mut grinder);
     assert_says(&look, &["done.json", "before the map", "ignored"]);
+    assert!(!look.start_confirmed && !look.notes.iter().any(|note| note.contains("started.json was")), "{look:?}");
     assert_says(&look, &["regrind confirm started"]);
     shop.put("started.json", r#"{"map": "0123456789abcdef"}"#);
     let look = settled(&mut grinder);
@@ -744,6 +754,10 @@ impl Exchange for Hanging {
 
     fn poll(&mut self, now: Duration, job: Job) -> Result<PollResult<Measurement>, ExchangeError> {
         self.folders.poll(now, job)
+    }
+
+    fn step(&mut self, job: Job, start_confirmed: bool) -> Result<Option<OperatorStep>, ExchangeError> {
+        self.folders.step(job, start_confirmed)
     }
 }
 

@@ -180,12 +180,11 @@ fn rehearsal_is_marked_simulation() {
 }
 
 /// A person at the page loads, grinds and measures a part: each step with its file comes from the page, and each
-/// confirmation and each measurement goes through it.
-#[test]
-fn manual_part_by_page_alone() {
-    let home = tempfile::tempdir().unwrap();
+/// confirmation and each measurement goes through it. `at_once` is true if a file that is not good is refused when it
+/// is sent; otherwise the page shows the reason afterwards.
+fn make_part_by_page(home: tempfile::TempDir, cell: &Path, at_once: bool) {
     let (recipe, spec) = recipe(home.path());
-    let (recipe, cell) = (recipe.display().to_string(), root().join("config/manual.toml").display().to_string());
+    let (recipe, cell) = (recipe.display().to_string(), cell.display().to_string());
     let mut program = Running::new(regrind(&["run", &recipe, "--cell", &cell, "--part", "SN-7"], home.path()));
     let folder = program.folder(home.path());
     let run = folder.file_name().unwrap().to_str().unwrap().to_owned();
@@ -194,57 +193,94 @@ fn manual_part_by_page_alone() {
     let visitor = Visitor::with_key(url.trim_start_matches("page").trim());
     let mut person = Person { home, world: World::new(spec).unwrap(), measured: 0 };
     assert_eq!(visitor.take_control(&run).0, 200);
-    let order = |order: &str| visitor.order(&run, &serde_json::json!({ "order": order }));
+    let shown = || visitor.get(&format!("/runs/{run}")).text();
     let (mut cycle, mut last) = (0, String::new());
     while !program.is_over() {
-        let shown = visitor.get(&format!("/runs/{run}")).text();
+        let shown_now = shown();
+        let attribute = |name: &str| shown_now.split(&format!("{name}=\"")).nth(1)?.split('"').next();
+        let order =
+            |order: &str| visitor.order(&run, &serde_json::json!({ "order": order, "map": attribute("data-map") }));
         // The page follows the cell: the step that was just confirmed can still stand on it.
-        let step = shown.split("data-order=\"").skip(1).map(|rest| rest.split('"').next().unwrap().to_owned());
-        let step = step.filter(|order| ["loaded", "started", "done", "measurement"].contains(&order.as_str()));
-        let step = step.collect::<String>();
+        let steps = ["loaded", "started", "done", "measurement"];
+        let step = steps.into_iter().find(|order| shown_now.contains(&format!("data-order=\"{order}\"")));
+        let step = step.unwrap_or_default().to_owned();
         if std::mem::replace(&mut last, step.clone()) == step {
             continue;
         }
-        let offers = |order: &str| shown.contains(&format!("data-order=\"{order}\""));
         let step_file = || {
             let answer = visitor.get(&format!("/runs/{run}/step-file"));
-            (answer.status == 200).then_some(answer.body)
+            assert_eq!(answer.status, 200, "{step}");
+            answer.body
         };
-        if offers("loaded") {
-            assert!(order("loaded").1);
-        } else if offers("started") {
-            cycle += 1;
-            let before = folder.join(format!("cycle-{}", cycle - 1));
-            // The page gives the program of this pass and no other file.
-            assert!(shown.contains("toolpath.ngc"), "{shown}");
-            assert!(step_file().unwrap() == fs::read(before.join("toolpath.ngc")).unwrap());
-            // A pass that has not begun cannot end, and a browser names no file of this computer.
-            assert!(!order("done").1);
-            let named = serde_json::json!({ "order": "done", "file": "/etc/hostname" });
-            assert_eq!(visitor.order(&run, &named).0, 400);
-            assert!(order("started").1);
-            person.grinds(&before.join("correction.csv"), cycle);
-        } else if offers("done") {
-            assert!(order("done").1);
-        } else if offers("measurement") {
-            let plan = step_file().unwrap();
-            let list = person.home.path().join("plan-of-the-page.csv");
-            fs::write(&list, plan).unwrap();
-            let measured = fs::read(person.measures(&list)).unwrap();
-            let (status, accepted, why) = visitor.send_measurement(&run, "half.csv", &measured[..measured.len() / 2]);
-            assert!(status == 200 && !accepted && why.contains("half.csv") && !why.contains("/.uploaded"), "{why}");
-            let (_, accepted, why) = visitor.send_measurement(&run, "whole.csv", &measured);
-            assert!(accepted, "{why}");
-            assert!(fs::read(folder.join(format!("cycle-{cycle}/result.csv"))).unwrap() == measured);
+        match step.as_str() {
+            "loaded" | "done" => assert!(order(&step).1),
+            "started" => {
+                cycle += 1;
+                let before = folder.join(format!("cycle-{}", cycle - 1));
+                // The page gives the program of this pass.
+                assert!(shown_now.contains("toolpath.ngc"), "{shown_now}");
+                assert!(step_file() == fs::read(before.join("toolpath.ngc")).unwrap());
+                // A browser names no file of this computer.
+                let named = serde_json::json!({ "order": "done", "file": "/etc/hostname" });
+                assert_eq!(visitor.order(&run, &named).0, 400);
+                assert!(order("started").1);
+                person.grinds(&before.join("correction.csv"), cycle);
+            }
+            "measurement" => {
+                let list = person.home.path().join("plan-of-the-page.csv");
+                fs::write(&list, step_file()).unwrap();
+                let measured = fs::read(person.measures(&list)).unwrap();
+                let name = format!("half-{cycle}.csv");
+                let (status, accepted, why) = visitor.send_measurement(&run, &name, &measured[..measured.len() / 2]);
+                assert!(status == 200 && accepted != at_once && !why.contains("/.uploaded"), "{why}");
+                assert!(!at_once || why.contains(&name), "{why}");
+                let began = Instant::now();
+                let is_refused = |text: &str| text.contains("not accepted");
+                while !at_once && !is_refused(&shown()) {
+                    assert!(began.elapsed() < PATIENCE, "{}", shown());
+                }
+                let (_, accepted, why) = visitor.send_measurement(&run, &format!("whole-{cycle}.csv"), &measured);
+                assert!(accepted, "{why}");
+            }
+            _ => {}
         }
     }
     let (code, errors) = program.end();
     assert_eq!(code, 0, "{errors}");
     assert!(cycle > 1 && program.output_lines.iter().any(|line| line.starts_with("ACCEPTED")));
+    // An old confirmation in the inbox is no news.
+    let complains = |line: &&String| line.contains("was in the inbox before");
+    assert_eq!(program.output_lines.iter().find(complains), None);
     // Nothing of what was sent is left beside the record.
     assert!(!folder.join(".uploaded").exists());
     let (code, told) = person.types("audit verify");
     assert_eq!(code, 0, "{told}");
+}
+
+#[test]
+fn manual_part_by_page_alone() {
+    make_part_by_page(tempfile::tempdir().unwrap(), &root().join("config/manual.toml"), true);
+}
+
+#[test]
+fn file_exchange_part_by_page_alone() {
+    let home = tempfile::tempdir().unwrap();
+    let folders = ["cmm/out", "cmm/in", "grinder/out", "grinder/in"].map(|folder| home.path().join(folder));
+    folders.iter().for_each(|folder| fs::create_dir_all(folder).unwrap());
+    let cell = home.path().join("cell.toml");
+    let in_home = format!("\"{}/", home.path().display());
+    let text = changed(
+        "config/file-exchange.toml",
+        &[("\"../exchange/", &in_home), ("stable_for_s = 2.0", "stable_for_s = 0.05")],
+    );
+    // The simulated machine measures in the frame of the part.
+    let text: String = text
+        .lines()
+        .filter(|line| !line.contains("_mm = [0.0, 0.0, 3600.0]") && !line.contains("rotation_deg"))
+        .map(|line| format!("{line}\n"))
+        .collect();
+    fs::write(&cell, text).unwrap();
+    make_part_by_page(home, &cell, false);
 }
 
 #[test]

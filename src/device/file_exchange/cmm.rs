@@ -14,15 +14,18 @@ use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use super::dmis;
-use super::outbox::{AcceptedFiles, HandOverHeader, Outbox, StoredHandover, json_lines, read_json, unhex};
+use super::outbox::{
+    AcceptedFiles, HandOverHeader, Outbox, StoredHandover, absolute, json_lines, read_json, rename, unhex,
+};
 use super::result_requirements::{ResultRequirements, assemble_measurement, check_measurement, contradiction};
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Watch, WatchedFile};
-use super::{Exchange, ExchangeError, HandOver, HandOverStatus, MeasureOrder, Pattern, Permit, PollResult};
+use super::{Exchange, ExchangeError, HandOver, HandOverStatus, MeasureOrder, Pattern, Permit, PollResult, file_word};
 use crate::{Job, MeasuredPoint, Measurement, Plan, PlanTarget, TargetKind};
-use regrind_formats::FormatError;
+use regrind_formats::operator_step::{OperatorAction, OperatorStep, RequiredPoints, StepConfirmation};
 use regrind_formats::references::{References, parse_references, read_references};
 use regrind_formats::result::{Content, Coordinates, ResultFile, parse_result, read_bytes, read_statements};
+use regrind_formats::{FormatError, write_atomic};
 
 /// Name of the table of the targets in a hand-over.
 const PLAN_TABLE: &str = "plan.csv";
@@ -128,6 +131,8 @@ pub struct CmmFolders {
     expected: Option<Expected>,
     /// Content of the folder at the last check, and the result of that check.
     last_judgement: Option<(Vec<WatchedFile>, PollResult<Measurement>)>,
+    /// Name of the file of the inbox that a person sent last for the expected result.
+    sent: Option<String>,
 }
 
 /// Checker that reads the files of the inbox and compares them with the expected result.
@@ -189,7 +194,15 @@ impl CmmFolders {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
         let judge = Arc::new(Judge { settings, outbox });
-        Self { judge, watch, running_judgement: None, published: None, expected: None, last_judgement: None }
+        Self {
+            judge,
+            watch,
+            running_judgement: None,
+            published: None,
+            expected: None,
+            last_judgement: None,
+            sent: None,
+        }
     }
 
     /// Returns the data of the result that is expected for `job`: the hand-over (the folder with the files for the
@@ -637,7 +650,7 @@ impl Exchange for CmmFolders {
             files.push(("plan.dmi", dmis::program(&order.plan, &about).into_bytes()));
         }
         self.judge.outbox.publish(&ticket, &files, permit)?;
-        (self.expected, self.last_judgement, self.running_judgement) = (None, None, None);
+        (self.expected, self.last_judgement, self.running_judgement, self.sent) = (None, None, None, None);
         self.published = Some((job, Arc::new(order.plan.clone())));
         Ok(())
     }
@@ -645,6 +658,47 @@ impl Exchange for CmmFolders {
     fn mark(&mut self, job: Job, standing: HandOverStatus) -> Result<(), ExchangeError> {
         (self.expected, self.last_judgement, self.running_judgement) = (None, None, None);
         self.judge.outbox.mark(job, standing)
+    }
+
+    fn step(&mut self, job: Job, _: bool) -> Result<Option<OperatorStep>, ExchangeError> {
+        if self.judge.settings.stations.is_some() {
+            return Ok(None);
+        }
+        let Expected { stored, targets, .. } = self.expect(job)?;
+        let points = match self.judge.settings.free_count {
+            true => RequiredPoints::AtLeast(self.judge.settings.min_points),
+            false => RequiredPoints::Listed { count: targets.len(), file: absolute(&stored.path.join(PLAN_TABLE)) },
+        };
+        let action = OperatorAction::Measure {
+            part: stored.header.part.clone(),
+            cycle: job.batch_id().to_string(),
+            points,
+            plan: stored.header.identity.get(..8).map(str::to_owned),
+            probe_radius_mm: Some(stored.header.tool_radius_mm),
+        };
+        let confirmation = Some(StepConfirmation::DoneWithFile);
+        Ok(Some(OperatorStep { action, confirmation, named_map: None }))
+    }
+
+    fn take_file(&mut self, job: Job, file: &Path) -> Result<(), ExchangeError> {
+        let Expected { stored, .. } = self.expect(job)?;
+        if self.judge.settings.stations.is_some() || stored.status != HandOverStatus::Open {
+            return Err(ExchangeError::NotOpen { job: job.job, cycle: job.cycle });
+        }
+        let HandOverHeader { part, job, cycle, .. } = &stored.header;
+        let (pattern, inbox) = (self.judge.settings.result.filled(part, *job, *cycle), &self.judge.settings.inbox);
+        let name = fitting_name(file, &pattern)?;
+        let bytes = read_bytes(file)?;
+        // A person who sends a file again replaces the one that was sent before and not accepted.
+        if let Some(before) = self.sent.take().filter(|before| inbox.join(before).exists()) {
+            set_aside(inbox, &before)?;
+        }
+        if inbox.join(&name).exists() {
+            return Err(ExchangeError::NameTaken { path: file.to_owned(), inbox: inbox.clone() });
+        }
+        write_atomic(&inbox.join(&name), &bytes)?;
+        self.sent = Some(name);
+        Ok(())
     }
 
     fn poll(&mut self, now: Duration, job: Job) -> Result<PollResult<Measurement>, ExchangeError> {
@@ -680,6 +734,34 @@ impl Exchange for CmmFolders {
         self.last_judgement = Some((of, look.clone()));
         Ok(look)
     }
+}
+
+/// Returns a name for the file `file` of a person that fits `pattern`. Keeps the name of the file if possible. Otherwise
+/// the characters of the star are its extension, or all of its name.
+///
+/// # Errors
+/// The name does not fit, and the pattern has not exactly one star.
+fn fitting_name(file: &Path, pattern: &Pattern) -> Result<String, ExchangeError> {
+    let name = file.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    if !name.starts_with('.') && pattern.fits(name) {
+        return Ok(name.to_owned());
+    }
+    let star = match file.extension().and_then(|extension| extension.to_str()) {
+        Some(extension) if pattern.with_star("").as_str().ends_with('.') => extension,
+        _ => name,
+    };
+    let fitting = pattern.with_star(&file_word(star)).as_str().to_owned();
+    match pattern.star(&fitting) {
+        Some(_) => Ok(fitting),
+        None => Err(ExchangeError::NameUnfit { path: file.to_owned(), pattern: pattern.as_str().to_owned() }),
+    }
+}
+
+/// Renames a file of the folder `inbox` that a person replaces, so that it is no longer read. It stays there.
+fn set_aside(inbox: &Path, name: &str) -> Result<(), ExchangeError> {
+    let names = (1..).map(|k| inbox.join(format!(".replaced-{k}-{name}")));
+    let aside = names.into_iter().find(|path| !path.exists()).expect("some number is free");
+    Ok(rename(&inbox.join(name), &aside)?)
 }
 
 fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
@@ -784,4 +866,21 @@ fn plan_json(ticket: &HandOverHeader, order: &MeasureOrder, settings: &CmmExchan
         "careful_targets": plan.careful_start.map_or(0, |careful| careful.target_count),
         "careful_speed_mm_s": plan.careful_start.map(|careful| careful.speed_mm_s),
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sent_file_gets_fitting_name() {
+        let name = |file: &str, pattern: &str| fitting_name(Path::new(file), &Pattern::new(pattern)).ok();
+        assert_eq!(name("a/SN-7_c1.csv", "SN-7_c1.*").as_deref(), Some("SN-7_c1.csv"));
+        assert_eq!(name("a/points.csv", "SN-7_c1.*").as_deref(), Some("SN-7_c1.csv"));
+        assert_eq!(name("points.csv", "SN-7_*_c1").as_deref(), Some("SN-7_points.csv_c1"));
+        assert_eq!(name("points", "SN-7_c1.*").as_deref(), Some("SN-7_c1.points"));
+        assert_eq!(name("points.csv", "result.txt"), None);
+        assert_eq!(name("points.csv", "*_c1_*"), None);
+        assert_eq!(name("result.txt", "result.txt").as_deref(), Some("result.txt"));
+    }
 }

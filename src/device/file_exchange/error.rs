@@ -24,6 +24,12 @@ pub enum ExchangeError {
          contacts` above the points, or `coordinates = \"centres\"` into the cell file"
     )]
     CoordinatesUnstated { path: PathBuf },
+    /// The name of a file that a person sends is not one that the inbox expects.
+    #[error("{path}: the name does not fit {pattern}, the names of result files in the cell file; rename the file")]
+    NameUnfit { path: PathBuf, pattern: String },
+    /// The inbox has a file of this name, which a person put there.
+    #[error("{path}: {inbox} has a file for this measurement already; move it to another folder first")]
+    NameTaken { path: PathBuf, inbox: PathBuf },
     /// The number of points differs from the number of targets of the plan.
     #[error(
         "{path}: {found} points for a plan of {expected} targets; export the complete measurement, or add a column \

@@ -1,7 +1,8 @@
 //! Folders of a grinder: map and pass go out, operator confirmations for start and end come in.
 //!
 //! `correction.csv` has one row per node, `x_mm,y_mm,correction_mm`, row by row with x fastest. `correction.json` gives
-//! grid, sign, frame, units, the pass, and the hash that a confirmation has to name. `started.json` and `done.json` are
+//! grid, sign, frame, units, the pass, and the hash that a confirmation has to name. If the run has a program for the
+//! pass, it lies beside them. `started.json` and `done.json` are
 //! in the same folder. The person who begins and ends the job copies them into the inbox; `regrind confirm` writes the
 //! same files.
 
@@ -13,16 +14,22 @@ use data_encoding::HEXLOWER;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::outbox::{AcceptedFiles, HandOverHeader, Outbox, StoredHandover, json_lines, read_json, unhex};
+use super::outbox::{AcceptedFiles, HandOverHeader, Outbox, StoredHandover, absolute, json_lines, read_json, unhex};
 use super::watch::{Watch, WatchedFile};
 use super::{ConfirmedStep, Exchange, ExchangeError, GrindOrder, HandOver, HandOverStatus, Permit, PollResult};
 use crate::{CorrectionMap, Job, Outcome, PassRecord};
+use regrind_formats::operator_step::{OperatorAction, OperatorStep, StepConfirmation};
 use regrind_formats::result::read_bytes;
+use regrind_formats::run_files::{is_tool_path_file, program_for_pass};
 use regrind_formats::write_atomic;
 
 /// Names of the two confirmation files in the inbox.
 const STARTED: &str = "started.json";
 const DONE: &str = "done.json";
+/// Name of the table of the map in a hand-over.
+const MAP_TABLE: &str = "correction.csv";
+/// Name of the file with the settings of the pass in a hand-over.
+const PASS_DOCUMENT: &str = "correction.json";
 
 /// Settings of the file exchange with a grinder.
 #[derive(Clone, Debug)]
@@ -33,6 +40,8 @@ pub struct GrinderExchange {
     pub outbox: PathBuf,
     /// Folder in which confirmations appear.
     pub inbox: PathBuf,
+    /// Folder of the run, with the program of each pass.
+    pub run_folder: PathBuf,
     /// Time without a change after which a file is complete.
     pub stable_for: Duration,
 }
@@ -44,6 +53,8 @@ pub struct GrinderFolders {
     outbox: Outbox,
     watch: Watch,
     expected: Option<StoredHandover>,
+    /// Action that begins the pass of the expected hand-over, once its files were read for it.
+    step: Option<(Job, OperatorAction)>,
     /// Time at which the start was seen, by the clock of the driver.
     started: Option<Duration>,
 }
@@ -114,7 +125,7 @@ impl GrinderFolders {
     pub fn new(settings: GrinderExchange) -> Self {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
-        Self { settings, outbox, watch, expected: None, started: None }
+        Self { settings, outbox, watch, expected: None, step: None, started: None }
     }
 
     fn expect(&mut self, job: Job) -> Result<StoredHandover, ExchangeError> {
@@ -140,6 +151,12 @@ impl GrinderFolders {
     ) -> Option<(Confirmation, String)> {
         let file = found.iter().find(|f| f.name == name)?;
         if stored.header.is_earlier(name, &file.stamp) {
+            // The confirmation of an earlier pass, as its hand-over has it, stays in the inbox and is no news.
+            let identity = &stored.header.identity;
+            let is_of_earlier = |of: &Confirmation| of.map.len() == identity.len() && of.map != *identity;
+            if read_json::<Confirmation>(&file.path).is_ok_and(|earlier| is_of_earlier(&earlier)) {
+                return None;
+            }
             notes.push(format!("{name} was in the inbox before the map was handed over; this file is ignored"));
             return None;
         }
@@ -154,6 +171,36 @@ impl GrinderFolders {
             Ok((confirmation, HEXLOWER.encode(&Sha256::digest(&bytes))))
         };
         read().map_err(|error| notes.push(format!("not accepted: {error}"))).ok()
+    }
+
+    /// Returns the action with which a person begins the pass of `stored`. Reads it from the files of the hand-over,
+    /// because an earlier process may have written them.
+    ///
+    /// # Errors
+    /// The file with the settings of the pass cannot be read, or somebody has changed its layout.
+    fn begin_pass(stored: &StoredHandover) -> Result<OperatorAction, ExchangeError> {
+        #[derive(Deserialize)]
+        struct HandedOver {
+            program: Option<String>,
+            pass: HandedOverPass,
+        }
+        #[derive(Deserialize)]
+        struct HandedOverPass {
+            wheel_radius_mm: f64,
+            feed_mm_min: f64,
+            spark_out_passes: u16,
+        }
+        let HandedOver { program, pass } = read_json(&stored.path.join(PASS_DOCUMENT))?;
+        let file = program.as_deref().filter(|name| is_tool_path_file(name)).unwrap_or(MAP_TABLE);
+        Ok(OperatorAction::BeginPass {
+            part: stored.header.part.clone(),
+            cycle: stored.header.cycle.into(),
+            program: Some(absolute(&stored.path.join(file))),
+            map: map_digits(&stored.header),
+            wheel_radius_mm: pass.wheel_radius_mm,
+            feed_mm_min: pass.feed_mm_min,
+            spark_out_passes: pass.spark_out_passes,
+        })
     }
 
     fn record(&self, stored: &StoredHandover, done: &Confirmation, now: Duration) -> PassRecord {
@@ -177,17 +224,22 @@ impl Exchange for GrinderFolders {
     }
 
     fn publish(&mut self, job: Job, sequence: u32, order: &GrindOrder, permit: &Permit) -> Result<(), ExchangeError> {
-        let GrinderExchange { part, inbox, .. } = &self.settings;
+        let GrinderExchange { part, inbox, run_folder, .. } = &self.settings;
         let ticket = HandOverHeader::new(part, job, sequence, &order.map_identity, order.pass.wheel_radius_mm, inbox)?;
         let word = json_lines(&serde_json::json!(Confirmation::from_ticket(&ticket)));
-        let files = [
-            ("correction.csv", correction_csv(&ticket, &order.map).into_bytes()),
-            ("correction.json", json_lines(&correction_json(&ticket, order, inbox))),
+        let program = program_for_pass(run_folder, job.cycle.into());
+        let name = program.as_ref().and_then(|path| path.file_name()?.to_str());
+        let mut files = vec![
+            (MAP_TABLE, correction_csv(&ticket, &order.map).into_bytes()),
+            (PASS_DOCUMENT, json_lines(&correction_json(&ticket, order, name, inbox))),
             (STARTED, word.clone()),
             (DONE, word),
         ];
+        if let Some((path, name)) = program.as_ref().zip(name) {
+            files.push((name, read_bytes(path)?));
+        }
         self.outbox.publish(&ticket, &files, permit)?;
-        (self.expected, self.started) = (None, None);
+        (self.expected, self.started, self.step) = (None, None, None);
         Ok(())
     }
 
@@ -207,7 +259,7 @@ impl Exchange for GrinderFolders {
         let begun = self.started.is_some() || done.is_some();
         let Some((done, sha)) = done else {
             let (what, word, file) = if begun { ("end", "done", DONE) } else { ("start", "started", STARTED) };
-            let map = stored.header.identity.get(..8).unwrap_or_default();
+            let map = map_digits(&stored.header);
             notes.push(format!(
                 "waiting for the confirmation of the {what} of the pass: type regrind confirm {word} --map {map}, or \
                  copy {file} from {} to {}",
@@ -225,6 +277,21 @@ impl Exchange for GrinderFolders {
         Ok(PollResult { answer: Some(self.record(&stored, &done, now)), start_confirmed: begun, notes })
     }
 
+    fn step(&mut self, job: Job, start_confirmed: bool) -> Result<Option<OperatorStep>, ExchangeError> {
+        let stored = self.expect(job)?;
+        let named_map = Some(map_digits(&stored.header));
+        if start_confirmed {
+            let (action, confirmation) = (OperatorAction::EndPass, Some(StepConfirmation::Done));
+            return Ok(Some(OperatorStep { action, confirmation, named_map }));
+        }
+        let action = match self.step.take().filter(|(of, _)| *of == job) {
+            Some((_, action)) => action,
+            None => Self::begin_pass(&stored)?,
+        };
+        self.step = Some((job, action.clone()));
+        Ok(Some(OperatorStep { action, confirmation: Some(StepConfirmation::Started), named_map }))
+    }
+
     fn confirm(&mut self, job: Job, what: ConfirmedStep, map_identity: [u8; 32]) -> Result<(), ExchangeError> {
         let stored = self.expect(job)?;
         if HEXLOWER.encode(&map_identity) != stored.header.identity {
@@ -237,6 +304,11 @@ impl Exchange for GrinderFolders {
         let word = json_lines(&serde_json::json!(Confirmation::from_ticket(&stored.header)));
         Ok(write_atomic(&self.settings.inbox.join(name), &word)?)
     }
+}
+
+/// Returns the digits of the identity of the map that a confirmation has to name at least.
+fn map_digits(ticket: &HandOverHeader) -> String {
+    ticket.identity.get(..8).unwrap_or_default().to_owned()
 }
 
 fn correction_csv(ticket: &HandOverHeader, map: &CorrectionMap) -> String {
@@ -255,11 +327,16 @@ fn correction_csv(ticket: &HandOverHeader, map: &CorrectionMap) -> String {
     text
 }
 
-fn correction_json(ticket: &HandOverHeader, order: &GrindOrder, inbox: &Path) -> serde_json::Value {
+fn correction_json(
+    ticket: &HandOverHeader,
+    order: &GrindOrder,
+    program: Option<&str>,
+    inbox: &Path,
+) -> serde_json::Value {
     let (map, grid, pass) = (&order.map, &order.map.grid, &order.pass);
     serde_json::json!({
         "kind": "correction map", "part": ticket.part, "job": ticket.job, "cycle": ticket.cycle, "map": ticket.identity,
-        "units": "mm", "frame": "model",
+        "program": program, "units": "mm", "frame": "model",
         "sign": "a positive value leaves material, along the outward normal", "absolute": true,
         "columns": grid.columns, "rows": grid.rows, "first_mm": grid.first_mm, "spacing_mm": grid.spacing_mm,
         "nominal_surface": HEXLOWER.encode(&map.part_identity),

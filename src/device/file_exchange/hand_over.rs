@@ -1,11 +1,13 @@
 //! Interface of the driver to the folders, so that the driver itself writes no file.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::Duration;
 
 use super::ExchangeError;
 use crate::Job;
+use regrind_formats::operator_step::OperatorStep;
 
 /// Two folders that represent a machine: one for hand-overs, one for answers.
 ///
@@ -47,6 +49,21 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
     /// for a person, for example which files are awaited. `now` is the time since the driver was created. See
     /// [`PollResult`].
     fn poll(&mut self, now: Duration, job: Job) -> Result<PollResult<Self::Answer>, ExchangeError>;
+
+    /// Returns the step that the open hand-over of `job` asks of a person. `start_confirmed` is true if the machine has
+    /// begun. Returns `None` if this exchange describes what it waits for by notes alone.
+    ///
+    /// # Errors
+    /// Returns an error if the hand-over cannot be read.
+    fn step(&mut self, job: Job, start_confirmed: bool) -> Result<Option<OperatorStep>, ExchangeError>;
+
+    /// Puts the file `_file` of a person into the inbox, as an answer to `job`. It is then checked like each file there.
+    ///
+    /// # Errors
+    /// The default always returns an error: a confirmation needs no file.
+    fn take_file(&mut self, job: Job, _file: &Path) -> Result<(), ExchangeError> {
+        Err(ExchangeError::NotOpen { job: job.job, cycle: job.cycle })
+    }
 
     /// Records that a person has confirmed a step of `job`. `_what` states the step: the machine has begun, or the
     /// machine has ended and the part is clear. `_map_identity` is the SHA-256 of the correction map of the job.

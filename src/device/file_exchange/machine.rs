@@ -1,5 +1,6 @@
 //! State machine of a machine that consists of two folders and a person.
 
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError, TryLockError};
 use std::time::Duration;
 
@@ -11,6 +12,7 @@ use crate::{
     Machine, MachineCommand, MachineKind, MachineState, Measurement, OperatorConfirmation, Outcome, Pass, PassRecord,
     Plan, Reconciled, Started, Status, digest,
 };
+use regrind_formats::operator_step::OperatorStep;
 
 /// Machine that is reached through two folders.
 ///
@@ -42,6 +44,8 @@ struct FolderMachine<M: Exchange> {
     answer: Option<M::Answer>,
     start_confirmed: bool,
     notes: Vec<String>,
+    /// Step that the open hand-over asks of a person.
+    step: Option<OperatorStep>,
     owned: bool,
     /// True if this machine cannot reach the part while the part is at the other machine.
     cannot_reach_part: bool,
@@ -71,6 +75,7 @@ impl<M: Exchange> ExchangeMachine<M> {
             answer: None,
             start_confirmed: false,
             notes: Vec::new(),
+            step: None,
             owned: false,
             cannot_reach_part: false,
             clear_of_part: None,
@@ -210,6 +215,7 @@ impl<M: Exchange> FolderMachine<M> {
     /// the answer has arrived, stores it and changes the state to COMPLETE. `now` is the time since the driver was
     /// created.
     fn poll_answer(&mut self, now: Duration) -> DeviceResult<()> {
+        self.step = None;
         let Some((job, sequence)) = self.job.filter(|_| self.state == MachineState::Execute) else { return Ok(()) };
         let look = self.exchange.poll(now, job).map_err(|error| self.failed(MachineCommand::Start, error))?;
         self.notes = look.notes;
@@ -218,6 +224,9 @@ impl<M: Exchange> FolderMachine<M> {
             self.answer = look.answer;
             self.clear_of_part = (self.kind == MachineKind::Grinder).then_some(true);
             self.finish(Outcome::Complete, sequence);
+        } else {
+            // Without the step, the notes still say what is awaited.
+            self.step = self.exchange.step(job, self.start_confirmed).unwrap_or_default();
         }
         Ok(())
     }
@@ -425,6 +434,27 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(Vec::new())
     }
 
+    /// Puts the file `file` of a person into the inbox. Always returns an empty list of files.
+    ///
+    /// # Errors
+    /// Returns an error if the machine is not connected, if it measures nothing, or if the file cannot be put there.
+    fn take_file(&mut self, file: &Path) -> DeviceResult<Vec<String>> {
+        self.check_connected("a file")?;
+        if self.kind == MachineKind::Grinder {
+            let reason = "--file is allowed only for a measurement: remove --file".to_owned();
+            return Err(DeviceError::NotAccepted { machine: Arc::clone(&self.name), reason });
+        }
+        let Some((job, _)) = self.job.filter(|_| self.state == MachineState::Execute) else {
+            return Err(self.refused(MachineCommand::Start, Answer::WrongState));
+        };
+        let not_accepted = |error: ExchangeError| DeviceError::NotAccepted {
+            machine: Arc::clone(&self.name),
+            reason: error.to_string(),
+        };
+        self.exchange.take_file(job, file).map_err(not_accepted)?;
+        Ok(Vec::new())
+    }
+
     fn reconcile(&mut self, intended: &Armed) -> DeviceResult<Reconciled> {
         self.open()?;
         let Job { job, cycle, .. } = intended.job;
@@ -494,6 +524,13 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
             Ok(machine) => machine.notes.clone(),
             Err(TryLockError::Poisoned(machine)) => machine.into_inner().notes.clone(),
             Err(TryLockError::WouldBlock) => Vec::new(),
+        }
+    }
+
+    fn operator_step(&self) -> Option<OperatorStep> {
+        match self.machine.try_lock() {
+            Ok(machine) => machine.step.clone(),
+            Err(_) => None,
         }
     }
 
@@ -609,6 +646,9 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
 
     async fn confirm(&mut self, word: OperatorConfirmation) -> DeviceResult<Vec<String>> {
         let (what, map_identity) = match word {
+            OperatorConfirmation::Done { file: Some(file), .. } => {
+                return self.run_blocking("a file", move |machine, _| machine.take_file(&file)).await;
+            }
             OperatorConfirmation::Started { map_identity } => (ConfirmedStep::Started, map_identity),
             OperatorConfirmation::Done { map_identity, .. } => (ConfirmedStep::Done, map_identity),
             OperatorConfirmation::Still => {

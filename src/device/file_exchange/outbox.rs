@@ -239,6 +239,11 @@ impl Outbox {
     }
 }
 
+/// Returns a path that programs with another working folder can use too.
+pub(super) fn absolute(path: &Path) -> PathBuf {
+    std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
+}
+
 fn base_name(part: &str, job: Job) -> String {
     format!("{}_j{}_c{}", file_word(part), job.job, job.cycle)
 }
@@ -261,7 +266,7 @@ impl Drop for DraftFolder {
     }
 }
 
-fn rename(from: &Path, to: &Path) -> Result<(), FormatError> {
+pub(super) fn rename(from: &Path, to: &Path) -> Result<(), FormatError> {
     let failed = |action| move |source| FormatError::Unwritable { path: to.to_owned(), action, source };
     if to.exists() {
         return Err(failed("renaming it")(io::Error::from(io::ErrorKind::AlreadyExists)));

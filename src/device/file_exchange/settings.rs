@@ -116,6 +116,7 @@ impl DriverFactory for ExchangeWire {
     type Cmm = ExchangeMachine<CmmFolders>;
     type Grinder = ExchangeMachine<GrinderFolders>;
     const BY_PERSON: bool = true;
+    const READS_RUN_FOLDER: bool = true;
 
     fn check(&self, place: &MachineTable<'_>, document: &mut Document) {
         if self.outbox == self.inbox && !self.outbox.is_empty() {
@@ -166,7 +167,9 @@ impl DriverFactory for ExchangeWire {
     fn create_grinder(&self, context: &DriverContext<'_>) -> Result<Self::Grinder, DriverError> {
         let [outbox, inbox] = self.folders(context, MachineKind::Grinder)?;
         let stable_for = Duration::from_secs_f64(self.stable_for_s);
-        let settings = GrinderExchange { part: context.part.to_owned(), outbox, inbox: inbox.clone(), stable_for };
+        let run_folder = context.run_folder.to_owned();
+        let settings =
+            GrinderExchange { part: context.part.to_owned(), outbox, inbox: inbox.clone(), run_folder, stable_for };
         Ok(self.machine(MachineKind::Grinder, &inbox, GrinderFolders::new(settings)))
     }
 }

@@ -100,7 +100,7 @@ impl HitLinesCmm {
             MachineState::Aborting => (OperatorAction::Abort, None),
             _ => return None,
         };
-        Some(OperatorStep { action, confirmation })
+        Some(OperatorStep { action, confirmation, named_map: None })
     }
 
     fn measure(&self, session: &MeasurementSession, asked: &RequestedMeasurement) -> OperatorAction {

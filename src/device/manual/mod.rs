@@ -30,7 +30,7 @@ use super::{
 use regrind_formats::operator_step::{OperatorAction, OperatorStep, RequiredPoints, StepConfirmation, run_argument};
 use regrind_formats::result::{Content, read_bytes};
 use regrind_formats::run_files::{
-    CycleFile, CycleFolder, is_machine_result_file, is_tool_path_file, machine_result_file, plan_file,
+    CycleFile, CycleFolder, is_machine_result_file, machine_result_file, plan_file, program_for_pass,
 };
 use regrind_formats::{FormatError, ResultFolder, write_atomic};
 
@@ -168,7 +168,7 @@ impl ManualMachine {
             (MachineState::Aborting, _) => (OperatorAction::Abort, None),
             _ => return None,
         };
-        Some(OperatorStep { action, confirmation })
+        Some(OperatorStep { action, confirmation, named_map: None })
     }
 
     fn measure(&self, job: Job, plan: &Plan) -> OperatorAction {
@@ -195,7 +195,7 @@ impl ManualMachine {
         OperatorAction::BeginPass {
             part: self.settings.part.clone(),
             cycle: job.cycle.into(),
-            program: find_program(&folder).or_else(correction),
+            program: program_for_pass(&self.settings.run_folder, job.cycle.into()).or_else(correction),
             map: HEXLOWER.encode(&map[..4]),
             wheel_radius_mm: pass.wheel_radius_mm,
             feed_mm_min: pass.feed_mm_min,
@@ -525,17 +525,6 @@ impl Grinder for ManualMachine {
             _ => Err(DeviceError::NoResult { machine: Arc::clone(&self.name), job, state: self.state }),
         }
     }
-}
-
-/// Returns the path of the tool path program in `folder`, the folder of a cycle: a file named `toolpath` with any
-/// extension. If there are several, returns the first in alphabetical order. Returns `None` if there is none.
-fn find_program(folder: &Path) -> Option<PathBuf> {
-    let files = std::fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
-    let mut programs: Vec<PathBuf> = files
-        .filter(|file| file.is_file() && file.file_name().and_then(|name| name.to_str()).is_some_and(is_tool_path_file))
-        .collect();
-    programs.sort();
-    programs.into_iter().next()
 }
 
 #[cfg(test)]

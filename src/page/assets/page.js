@@ -105,8 +105,8 @@
     abort: () => ({ order: "abort", reason: "" }),
     loaded: () => ({ order: "loaded" }),
     clear: (button) => ({ order: "clear", device: button.dataset.device }),
-    started: () => ({ order: "started" }),
-    done: () => ({ order: "done" }),
+    started: (button) => ({ order: "started", map: button.dataset.map || null }),
+    done: (button) => ({ order: "done", map: button.dataset.map || null }),
     still: (button) => ({ order: "still", device: button.dataset.device }),
     over: (button) => ({ order: "over", device: button.dataset.device, evidence: element("evidence").value.trim() }),
   };
