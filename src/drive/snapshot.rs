@@ -81,8 +81,10 @@ fn next_step(cell: &Cell, asks: Option<Device>, waits_for: &[String]) -> NextSte
         // A machine that a person operates has no safe sequence of its own.
         (State::Aborting, ..) if asks.is_none() => NextStep::KeepAway,
         (State::Stopped | State::Aborted | State::Complete, ..) => NextStep::ReadReport,
-        _ if let Some(device) = asks => NextStep::AtMachine { device },
-        (_, _, [first, ..]) => NextStep::Bring { what: first.clone() },
-        _ => NextStep::Nothing,
+        (_, _, waits_for) => match (asks, waits_for) {
+            (Some(device), _) => NextStep::AtMachine { device },
+            (None, [first, ..]) => NextStep::Bring { what: first.clone() },
+            (None, []) => NextStep::Nothing,
+        },
     }
 }

@@ -19,31 +19,44 @@ use super::texts::{Language, Text};
 /// Returns the HTML of the step `step` of the machine `device`. `run` is the address of the run.
 pub(crate) fn card(step: &OperatorStep, device: Device, run: &str, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
-    let named = device.to_string().to_lowercase();
     html! {
         article .step {
             h3 { (device) ": " (say(title(&step.action))) }
             (table(&step.action, run, language))
             @let checks = checks(&step.action);
             @if !checks.is_empty() {
-                p .quiet { (say(Text::CheckFirst)) }
-                ul { @for check in checks { li { (say(check)) } } }
+                div .checks {
+                    p .quiet { (say(Text::CheckFirst)) }
+                    ul { @for check in checks { li { (say(check)) } } }
+                }
             }
             @if let Some(confirmation) = step.confirmation {
-                p { (say(before_confirmation(&step.action))) }
-                @match confirmation {
-                    StepConfirmation::Started => { button type="button" data-order="started" data-map=[&step.named_map] { (say(Text::PassHasBegun)) } }
-                    StepConfirmation::Done => { button type="button" data-order="done" data-map=[&step.named_map] { (say(Text::JobIsDone)) } }
-                    StepConfirmation::DoneWithFile => {
-                        label { (say(Text::MeasurementFile)) input id="result-file" type="file"; }
-                        button type="button" data-order="measurement" { (say(Text::SendMeasurement)) }
-                    }
-                    StepConfirmation::Still => {
-                        button type="button" data-order="still" data-device=(named) { (say(Text::IsAtRest)) }
-                    }
+                div .confirmation {
+                    p { (say(before_confirmation(&step.action))) }
+                    (button(confirmation, step, device, language))
                 }
             }
         }
+    }
+}
+
+/// Returns the HTML of the button that confirms `step`, with the field for a file if it needs one.
+fn button(confirmation: StepConfirmation, step: &OperatorStep, device: Device, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    let order = |name: &str, label: Text| {
+        let machine = device.to_string().to_lowercase();
+        html! {
+            button type="button" data-order=(name) data-device=(machine) data-map=[&step.named_map] { (say(label)) }
+        }
+    };
+    match confirmation {
+        StepConfirmation::Started => order("started", Text::PassHasBegun),
+        StepConfirmation::Done => order("done", Text::JobIsDone),
+        StepConfirmation::Still => order("still", Text::IsAtRest),
+        StepConfirmation::DoneWithFile => html! {
+            label { (say(Text::MeasurementFile)) input id="result-file" type="file"; }
+            (order("measurement", Text::SendMeasurement))
+        },
     }
 }
 
