@@ -3,7 +3,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use regrind::formats::user_name;
 use regrind::journal::{Reader, Record};
@@ -19,6 +19,8 @@ use sha2::{Digest, Sha256};
 use crate::program::{PATIENCE, Running, changed, regrind, replaced, root, run};
 
 const RADIUS_MM: f64 = 1.5;
+/// Interval in which a person looks at the page.
+const BETWEEN_LOOKS: Duration = Duration::from_millis(50);
 
 /// Returns the shipped mirror with 300 points. The probe is not checked on a sphere.
 fn recipe(home: &Path) -> (PathBuf, WorldSpec) {
@@ -205,6 +207,7 @@ fn make_part_by_page(home: tempfile::TempDir, cell: &Path, at_once: bool) {
         let step = steps.into_iter().find(|order| shown_now.contains(&format!("data-order=\"{order}\"")));
         let step = step.unwrap_or_default().to_owned();
         if std::mem::replace(&mut last, step.clone()) == step {
+            std::thread::park_timeout(BETWEEN_LOOKS);
             continue;
         }
         let step_file = || {
@@ -238,6 +241,7 @@ fn make_part_by_page(home: tempfile::TempDir, cell: &Path, at_once: bool) {
                 let is_refused = |text: &str| text.contains("not accepted");
                 while !at_once && !is_refused(&shown()) {
                     assert!(began.elapsed() < PATIENCE, "{}", shown());
+                    std::thread::park_timeout(BETWEEN_LOOKS);
                 }
                 let (_, accepted, why) = visitor.send_measurement(&run, &format!("whole-{cycle}.csv"), &measured);
                 assert!(accepted, "{why}");
