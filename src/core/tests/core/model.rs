@@ -234,21 +234,23 @@ fn measured_by_machine(seed: u64, machine: &MachineUncertainty, radius_sigma_mm:
 
 #[test]
 fn machine_uncertainty_widens_form() {
-    const MACHINES: u64 = 8;
+    let machines = seeds(8);
     let machine = MachineUncertainty { scale: [2e-5; 3], squareness_rad: [2e-5; 3], ..MachineUncertainty::default() };
     let radius_sigma_mm = 3e-4;
     let given = ModelInputs { machine, radius_sigma_mm, ..ModelInputs::default() };
     let (mut with, mut without, mut wider) = (0, 0, 0.0);
-    for seed in 0..MACHINES {
+    // An interval of 95 % misses one of twenty; 60 machines had 4 misses, all among the first 20.
+    let allowed = (machines / 5).max(1);
+    for seed in 0..machines {
         let (form, found) = measured_by_machine(seed, &machine, radius_sigma_mm);
         let model = Form::estimate(&found, &given).unwrap();
         let blind = Form::estimate(&found, &ModelInputs::default()).unwrap();
         let part = Part { form, truth: Pose::identity(), registration: found, model };
         let [true_rms, _] = figures(&part.form());
-        with += u32::from(contains(part.model.figures.rms, true_rms));
-        without += u32::from(contains(blind.figures.rms, true_rms));
+        with += u64::from(contains(part.model.figures.rms, true_rms));
+        without += u64::from(contains(blind.figures.rms, true_rms));
         let width = |form: &Form| form.figures.rms.high_mm - form.figures.rms.low_mm;
-        wider += width(&part.model) / width(&blind) / MACHINES as f64;
+        wider += width(&part.model) / width(&blind) / machines as f64;
         let squares = |of: fn(&BudgetEntry) -> f64| part.model.budget.iter().map(|s| of(s).powi(2)).sum::<f64>().sqrt();
         assert!((squares(|s| s.rms_mm) / part.model.figures.rms.standard_uncertainty_mm() - 1.0).abs() < 1e-9);
         let stated = |source| part.model.budget.iter().find(|s| s.source == source).unwrap().is_stated;
@@ -257,9 +259,9 @@ fn machine_uncertainty_widens_form() {
         );
     }
     println!(
-        "of {MACHINES} RMS held in {with} where it is stated, in {without} where it is not; {wider:.1} times as wide"
+        "of {machines} RMS held in {with} where it is stated, in {without} where it is not; {wider:.1} times as wide"
     );
-    assert!(with >= MACHINES as u32 - 1 && with > without && wider > 1.5, "{with} {without} {wider}");
+    assert!(with + allowed >= machines && with > without && wider > 1.5, "{with} {without} {wider}");
 }
 
 /// Returns a part that the fixture holds with an offset in x, y and about z, drawn from the standard uncertainties.

@@ -10,6 +10,7 @@ use regrind_core::compensation::{
 use regrind_core::geometry::{Point, Vector};
 use regrind_sim::form::FormError;
 use regrind_sim::shape::{FreeForm, Shape, Sphere};
+use regrind_testutils::sample::seeds;
 
 const WHEEL_MM: f64 = 12.5;
 const FREE_MOTIONS: [bool; 6] = [false, false, true, true, true, true];
@@ -137,16 +138,16 @@ fn parameters_of_pure_form_are_zero() {
         tolerances: [Some(0.1), None, None, None, None, None, None],
         ..ParameterOptions::new(WHEEL_MM)
     };
-    let mut taken = 0;
-    for seed in 0..20 {
+    let (mut taken, forms) = (0, seeds(8) as usize);
+    for seed in 0..forms as u64 {
         let form = FormError::with_rms(&mut regrind_sim::rng(seed), 14.0, 4e-4);
         let contacts = contacts_on(&FreeForm::default(), |c, _| form.height(c.point.x, c.point.y));
         let found = estimate_parameters(&contacts, None, &options).unwrap();
         taken += found.estimates.iter().filter(|p| p.compensated != 0.0).count();
     }
     // One of twenty is by chance beyond its expanded uncertainty.
-    println!("{taken} of 20 taken");
-    assert!(taken <= 3, "{taken} of 20");
+    println!("{taken} of {forms} taken");
+    assert!(taken <= 1 + forms / 10, "{taken} of {forms}");
 }
 
 #[test]
