@@ -2,7 +2,7 @@
 
 use regrind_testcell::http::Visitor;
 
-use crate::program::{replaced, run, run_folders, small_recipe};
+use crate::program::{SMALL_RECIPE_POINTS, replaced, run, run_folders, small_recipe};
 use crate::{CellPage, serve};
 
 #[test]
@@ -59,8 +59,8 @@ fn finished_run_pages() {
     // An error and its uncertainty per node.
     assert_eq!(map.body.len(), 40 + 8 * count(0) * count(4));
     let points = visitor.get(&format!("/runs/{}/cycles/1/points", ids[0]));
-    assert_eq!(points.body.len(), 300 * 12);
-    assert_eq!(visitor.get(&format!("/runs/{}/planned", ids[0])).body.len(), 300 * 8);
+    assert_eq!(points.body.len(), SMALL_RECIPE_POINTS * 12);
+    assert_eq!(visitor.get(&format!("/runs/{}/planned", ids[0])).body.len(), SMALL_RECIPE_POINTS * 8);
     assert_eq!(visitor.get(&format!("/runs/{}/cycles/9/map", ids[0])).status, 404);
 }
 

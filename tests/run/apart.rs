@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::program::{Running, changed, records_with, regrind, small_recipe};
+use crate::program::{Running, SMALL_RECIPE_POINTS, changed, records_with, regrind, small_recipe};
 use regrind::journal::verify;
 use serde_json::Value;
 
@@ -24,8 +24,8 @@ fn run_against(home: &Path, recipe: &str, cell: &str, serving: &mut Running) -> 
     assert_eq!(result["simulation"], true, "{result}");
     let transfers = records_with(&folder, "transfer");
     assert_eq!(transfers.len(), result["cycles"].as_array().unwrap().len(), "one for each measurement");
-    // 300 points of the part and 25 of the reference sphere.
-    assert!(transfers.iter().all(|t| t["transfer"]["points"] == 325), "{transfers:?}");
+    // The points of the part and 25 of the reference sphere.
+    assert!(transfers.iter().all(|t| t["transfer"]["points"] == SMALL_RECIPE_POINTS + 25), "{transfers:?}");
     serving.interrupt();
     assert_eq!(serving.end().0, 0, "a simulation that is ended by Ctrl-C ended well");
     transfers[0]["transfer"]["ms_per_point"].as_f64().unwrap()

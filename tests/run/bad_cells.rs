@@ -366,11 +366,11 @@ fn commands_refuse_broken_files() {
         ("empty", String::new()),
         ("syntax", replaced("[measure]", "[measure")),
         ("unknown", replaced("probe_radius_mm", "probe_radius_um")),
-        ("type", replaced("columns = 20", "columns = \"twenty\"")),
+        ("type", replaced("columns = 16", "columns = \"twenty\"")),
         ("range", replaced("removal_budget_um = 400.0", "removal_budget_um = 4e9")),
         ("nan", replaced("pv_um = 7.0", "pv_um = nan")),
         ("binary", "\u{0}\u{1}\u{2}".to_owned()),
-        ("contradiction", replaced("columns = 20", "columns = 0")),
+        ("contradiction", replaced("columns = 16", "columns = 0")),
     ];
     for (name, content) in &files {
         let file = format!("{name}.toml");

@@ -10,7 +10,7 @@ use regrind_testutils::sample::all;
 
 const RECIPE: &str = "freeform-mirror";
 
-/// Returns the usual setup. The whole pattern shows no more of a fault than a quarter of it, and takes three times as
+/// Returns the usual setup. The whole pattern shows no more of a fault than a sixth of it, and takes many times as
 /// long.
 fn usual() -> Setup {
     Setup { coarse: !all(), ..Setup::new(RECIPE, 1) }

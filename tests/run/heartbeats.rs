@@ -1,4 +1,4 @@
-//! No computation delays the communication with the machines: heartbeats and orders while 451,401 points are registered
+//! No computation delays the communication with the machines: heartbeats and orders while 113,201 points are registered
 //! and compensated.
 //!
 //! The machines, their wires and the drive are those of every simulated run. Only the points do not all come over the
@@ -14,7 +14,7 @@ use regrind::device::{
 use regrind::drive::{Drive, Request};
 use regrind_testcell::rig::{CMM, GRINDER, PATIENCE, Rig, event, order, until, words};
 
-const POINTS: usize = 451_401;
+const POINTS: usize = 113_201;
 /// Number of targets that are really measured: the reference sphere and a few more.
 const FEW: usize = 40;
 
@@ -59,9 +59,9 @@ impl Cmm for Generous {
 
 fn recipe() -> regrind::recipe::Recipe {
     regrind_testcell::rig::recipe(&[
-        ("columns = 60", "columns = 901"),
-        ("rows = 30", "rows = 501"),
-        ("accuracy_nm = 0.5", "spacing_mm = 0.118"),
+        ("columns = 60", "columns = 451"),
+        ("rows = 30", "rows = 251"),
+        ("accuracy_nm = 0.5", "spacing_mm = 0.236"),
         // A filter over thousands of points for each point would only take long.
         ("cutoff_mm = 5.0", "cutoff_mm = 2.0"),
         ("[simulation]\nseed = 1", "[simulation]\nseed = 1\nspeed = 5000.0"),
@@ -100,7 +100,7 @@ async fn heartbeats_continue_during_computation() {
     }
     until(&folder, |words| words.starts_with("Held")).await;
     order(&folder, Request::Resume { reason: String::new(), state_number: None }).await;
-    // The judgement is immediate. Now the map is computed from 451,401 deviations.
+    // The judgement is immediate. Now the map is computed from 113,201 deviations.
     let (reply, asked, _) = order(&folder, Request::Abort { reason: "while it computes".into() }).await;
     assert!(reply.accepted, "{reply:?}");
     let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();

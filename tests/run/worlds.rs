@@ -38,9 +38,9 @@ const PATIENCE: Duration = Duration::from_secs(3600);
 /// Seconds of machine time per second.
 const SPEED: f64 = 50_000.0;
 
-/// Replacements for the free-form mirror with a quarter of its points.
+/// Replacements for the free-form mirror with a sixth of its points.
 const COARSE: [(&str, &str); 3] =
-    [("columns = 60", "columns = 30"), ("rows = 30", "rows = 15"), ("cutoff_mm = 5.0", "cutoff_mm = 10.0")];
+    [("columns = 60", "columns = 24"), ("rows = 30", "rows = 12"), ("cutoff_mm = 5.0", "cutoff_mm = 12.0")];
 
 /// Changes that a test makes to a cell before it runs.
 pub struct Setup {
@@ -62,7 +62,7 @@ pub struct Setup {
     pub expansion_um_m_k: Option<f64>,
     /// True if touches are chosen.
     pub adaptive: bool,
-    /// True for a quarter of the points, in tests that do not depend on their number.
+    /// True for a sixth of the points, in tests that do not depend on their number.
     pub coarse: bool,
 }
 

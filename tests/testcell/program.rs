@@ -56,14 +56,17 @@ pub fn replaced(text: &str, from: &str, to: &str) -> String {
     text.replace(from, to)
 }
 
-/// Writes the shipped free-form mirror with 300 points as a recipe. Its machines need less than a second for a job.
+/// Number of points of the part that [`small_recipe`] measures.
+pub const SMALL_RECIPE_POINTS: usize = 16 * 12;
+
+/// Writes the shipped free-form mirror with few points as a recipe. Its machines need less than a second for a job.
 pub fn small_recipe(folder: &Path, speed: f64) -> PathBuf {
     let speed = format!("[simulation]\nseed = 1\nspeed = {speed:.1}");
     let changes = [
-        ("columns = 60", "columns = 20"),
-        ("rows = 30", "rows = 15"),
+        ("columns = 60", "columns = 16"),
+        ("rows = 30", "rows = 12"),
         ("accuracy_nm = 0.5", "spacing_mm = 0.5"),
-        ("cutoff_mm = 5.0", "cutoff_mm = 11.0"),
+        ("cutoff_mm = 5.0", "cutoff_mm = 14.0"),
         ("[simulation]\nseed = 1", &speed),
     ];
     let path = folder.join("small.toml");

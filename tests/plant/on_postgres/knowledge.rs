@@ -14,9 +14,9 @@ fn taught() -> (Plant, String) {
     for name in ["cell-1", "cell-2"] {
         plant.cell(name, &[]);
     }
-    let recipe = small_recipe(plant.home.path(), 1000.0);
+    let recipe = small_recipe(plant.home.path(), 1e5);
     let text = fs::read_to_string(&recipe).unwrap();
-    fs::write(&recipe, replaced(&text, "cutoff_mm = 11.0", "cutoff_mm = 11.0\nlearn = true")).unwrap();
+    fs::write(&recipe, replaced(&text, "cutoff_mm = 14.0", "cutoff_mm = 14.0\nlearn = true")).unwrap();
     let (folder, said) = made(&plant, "cell-1", "1");
     assert!(said.contains("begins without knowledge"), "{said}");
     plant.does(&["ship", "--once", "--plant", "cell-1.toml", "--runs", "cell-1"]);
