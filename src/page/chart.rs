@@ -5,7 +5,7 @@ use maud::{Markup, html};
 use regrind_cell::Tolerance;
 use regrind_report::CycleSummary;
 
-use super::texts::{Language, Text};
+use super::texts::{Language, Text, decimal};
 
 const WIDTH: f64 = 420.0;
 const HEIGHT: f64 = 190.0;
@@ -58,7 +58,7 @@ pub(crate) fn chart(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, ahea
             @for decade in scale.ticks() {
                 @let y = format!("{:.1}", scale.y(decade));
                 line .grid x1=(LEFT) x2=(WIDTH - RIGHT) y1=(y) y2=(y) {}
-                text .tick x=(LEFT - 6.0) y=(format!("{:.1}", scale.y(decade) + 4.0)) text-anchor="end" { (tick(decade)) }
+                text .tick x=(LEFT - 6.0) y=(format!("{:.1}", scale.y(decade) + 4.0)) text-anchor="end" { (tick(decade, language)) }
             }
             @for cycle in scale.first..=scale.last {
                 text .tick x=(format!("{:.1}", scale.x(cycle))) y=(HEIGHT - 6.0) text-anchor="middle" { (cycle) }
@@ -88,14 +88,14 @@ fn drawn(line: &Line, scale: &Scale, language: Language) -> Markup {
             polyline .line points=(middle) {}
             @for (cycle, value, u) in &line.points {
                 circle cx=(format!("{:.1}", scale.x(*cycle))) cy=(format!("{:.1}", scale.y(*value))) r="4" {
-                    title { (line.name) " " (format!("{value:.2} ± {u:.2} µm")) }
+                    title { (line.name) " " (decimal(*value, 2, language)) " ± " (decimal(*u, 2, language)) " µm" }
                 }
             }
             @if let Some((cycle, value)) = line.forecast {
                 @let (from, last) = line.points.last().map(|(cycle, value, _)| (*cycle, *value)).unwrap_or_default();
                 polyline .forecast points=(join(vec![at(from, last), at(cycle, value.max(scale.low))])) {}
                 circle .forecast cx=(format!("{:.1}", scale.x(cycle))) cy=(format!("{:.1}", scale.y(value.max(scale.low)))) r="4" {
-                    title { (line.name) " " (Text::Forecast.to(language)) " " (format!("{value:.2} µm")) }
+                    title { (line.name) " " (Text::Forecast.to(language)) " " (decimal(value, 2, language)) " µm" }
                 }
             }
         }
@@ -161,8 +161,10 @@ impl Scale {
     }
 }
 
-fn tick(value: f64) -> String {
-    if value >= 1.0 { format!("{value:.0}") } else { format!("{value}").chars().take(6).collect() }
+/// Returns the text of a value on the vertical axis, with as many decimals as it needs.
+fn tick(value: f64, language: Language) -> String {
+    let digits = (-value.log10().floor()).clamp(0.0, 4.0);
+    decimal(value, digits as usize, language)
 }
 
 #[cfg(test)]

@@ -13,12 +13,14 @@
 mod alarms;
 mod assets;
 mod chart;
+mod gauge;
 mod guard;
 mod guarded_server;
 mod history;
 mod live;
 mod operator_step;
 mod orders;
+mod pieces;
 mod rate;
 mod sessions;
 mod shape;

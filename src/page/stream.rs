@@ -14,9 +14,10 @@ use tokio::sync::watch::Receiver;
 
 use super::guard::Session;
 use super::live::ObservedRun;
+use super::pieces::{Piece, run_pieces};
 use super::shared::Shared;
 use super::texts::Language;
-use super::view::{self, Piece};
+use super::view;
 
 /// Maximum time between two messages of the stream. A browser that gets no message for longer shows that its figures
 /// are old.
@@ -71,7 +72,7 @@ impl RunEventStream {
         let seen = self.run.borrow_and_update().clone();
         let has_control = self.page.guard.has_control(&self.session, false);
         let mut pieces = Map::new();
-        for (piece, html) in view::pieces(&seen, has_control || !self.session.may("control"), self.language) {
+        for (piece, html) in run_pieces(&seen, has_control || !self.session.may("control"), self.language) {
             match self.sent.iter_mut().find(|(sent, _)| *sent == piece) {
                 Some((_, sent)) if *sent == html => continue,
                 Some((_, sent)) => sent.clone_from(&html),

@@ -40,6 +40,12 @@ impl Language {
     }
 }
 
+/// Formats a number with the given number of decimals, and with the decimal sign of `language`.
+pub(crate) fn decimal(value: f64, digits: usize, language: Language) -> String {
+    let text = format!("{value:.digits$}");
+    if language == Language::De { text.replacen('.', ",", 1) } else { text }
+}
+
 macro_rules! texts {
     ($($name:ident { $en:literal, $de:literal, $zh:literal })+) => {
         /// Text of the page.
@@ -104,9 +110,18 @@ texts! {
     Until { "Until", "Bis", "至" }
     Result { "Result", "Ergebnis", "结果" }
     Alarms { "Alarms", "Alarme", "报警" }
+    // Steps of a cycle.
+    LoadStep { "Load", "Laden", "装件" }
+    GrindStep { "Grind", "Schleifen", "磨削" }
+    MeasureStep { "Measure", "Messen", "测量" }
+    RegisterStep { "Register", "Einpassen", "配准" }
+    JudgeStep { "Judge", "Beurteilen", "判定" }
+    CorrectStep { "Correct", "Korrigieren", "补偿" }
+    StepsOfCycle { "Steps of the cycle", "Schritte des Zyklus", "循环步骤" }
+    ToEndOfStep { "to the end of this step", "bis zum Ende dieses Schritts", "距本步骤结束" }
+    HeldBy { "Held by", "Angehalten von", "保持人：" }
     // Column with the current work.
     NextAction { "Your next action", "Ihr nächster Schritt", "您的下一步" }
-    TimeLeft { "left", "verbleiben", "剩余" }
     PreliminaryPoints { "preliminary", "vorläufig", "初步" }
     PreliminaryMeans {
         "deviations relative to the planned position of the part, before the registration and before the judgement",
@@ -126,7 +141,14 @@ texts! {
     StoodAtTheEnd { "active at the end", "stand am Ende noch an", "结束时仍存在" }
     // Figures.
     Convergence { "Convergence", "Konvergenz", "收敛" }
-    Figures { "Figures", "Kennwerte", "数值" }
+    LastJudged { "Last judged", "Zuletzt beurteilt", "最近判定" }
+    Cycles { "Cycles", "Zyklen", "各循环" }
+    ThisRun { "This run", "Dieser Lauf", "本次运行" }
+    UncertaintyOfGauge {
+        "± and the dark band: expanded uncertainty, k = 2",
+        "± und dunkles Band: erweiterte Unsicherheit, k = 2",
+        "± 和深色带：扩展不确定度 k = 2"
+    }
     LeftOut { "Left out as outliers", "Als Ausreißer weggelassen", "作为离群点被排除" }
     Judged { "judged", "beurteilt", "判定" }
     Limit { "limit", "Grenze", "限值" }
@@ -138,8 +160,16 @@ texts! {
     Map { "Error map", "Fehlerkarte", "误差图" }
     Relief { "Relief", "Relief", "立体图" }
     Difference { "Change", "Änderung", "变化" }
+    DifferenceOfRuns { "Difference of the maps", "Differenz der Karten", "误差图之差" }
     Sigma { "Uncertainty", "Unsicherheit", "不确定度" }
     Points { "Points", "Punkte", "测点" }
+    Scale { "Scale", "Skala", "色标" }
+    ScaleOfFirst { "first cycle", "erster Zyklus", "首个循环" }
+    ScaleOfMap { "this map", "diese Karte", "本图" }
+    ScaleOfTolerance { "tolerance", "Toleranz", "公差" }
+    SignOfMap { "red: too high, blue: too low", "rot: zu hoch, blau: zu tief", "红色偏高，蓝色偏低" }
+    NoCycleBefore { "there is no map of the cycle before", "keine Karte des Zyklus davor", "没有上一循环的误差图" }
+    PlanShown { "the plan", "der Plan", "计划" }
     Histogram { "Distribution", "Verteilung", "分布" }
     NoRelief {
         "This browser cannot draw the relief (3D view). The page shows the error map instead.",

@@ -1,5 +1,5 @@
-//! Pages as HTML, in the language of the reader. Only this module makes the pieces of a run's page, both for the first
-//! response and for each later change.
+//! Pages as HTML, in the language of the reader: the frame around every page, the page of a run, the list of runs, the
+//! comparison, and the pages for a client without access.
 
 use axum::Extension;
 use axum::extract::{Path, Query, State};
@@ -8,75 +8,24 @@ use axum::http::{HeaderMap, HeaderName, StatusCode};
 use axum::response::{IntoResponse, Redirect, Response};
 use data_encoding::HEXLOWER;
 use maud::{DOCTYPE, Markup, html};
-use regrind_cell::{Alarm, Device, Role, StateName, Tolerance};
-use regrind_control::{JobProgress, NextStep, PreviewStatistics, Snapshot};
+use regrind_cell::{Device, StateName};
+use regrind_control::{NextStep, Snapshot};
 use regrind_formats::operator_step::StepConfirmation;
 use regrind_formats::run_files::RunFile;
-use regrind_report::{AlarmHistory, ColourMap, CycleSummary, RunResult, RunSummary};
+use regrind_report::{ColourMap, RunResult};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::task::spawn_blocking;
 
-use super::alarms::alarm_texts;
 use super::chart::chart;
 use super::guard::{Denied, Session, text};
 use super::history::Listed;
 use super::live::{ObservedRun, verdict};
-use super::operator_step;
+use super::pieces::{Piece, about, banner, figures, in_path, is_over, run_pieces, verdict_reason, when};
 use super::shared::Shared;
 use super::subject::PageSubject;
 use super::texts::{self, Language, Text};
 use super::users::Person;
-
-/// Piece of the page of a run, which is updated on its own.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Piece {
-    Banner,
-    About,
-    Next,
-    Job,
-    Alarms,
-    Figures,
-    Convergence,
-    Control,
-}
-
-impl Piece {
-    /// Returns the id of the HTML element that contains the piece.
-    pub(crate) fn id(self) -> &'static str {
-        match self {
-            Self::Banner => "banner",
-            Self::About => "about",
-            Self::Next => "next",
-            Self::Job => "job",
-            Self::Alarms => "alarms",
-            Self::Figures => "figures",
-            Self::Convergence => "convergence",
-            Self::Control => "control",
-        }
-    }
-}
-
-/// Returns the HTML of each piece of the page of a run. A piece is a part of the page that is updated on its own.
-/// `seen` is the current status of the run. If `has_control` is false and the program of the run answers, one piece
-/// offers to take control of the cell.
-pub(crate) fn pieces(seen: &ObservedRun, has_control: bool, language: Language) -> [(Piece, String); 8] {
-    let ObservedRun { snapshot, summary, .. } = seen;
-    let snapshot = snapshot.as_deref();
-    let live = snapshot.filter(|_| seen.answers);
-    let tolerance = summary.tolerance.as_ref();
-    [
-        (Piece::Banner, banner(seen, language)),
-        (Piece::About, about(seen, language)),
-        (Piece::Next, next(seen, language)),
-        (Piece::Job, live.map_or_else(Markup::default, |snapshot| job(snapshot, language))),
-        (Piece::Alarms, alarms(seen, language)),
-        (Piece::Figures, figures(&summary.cycles, tolerance, language)),
-        (Piece::Convergence, chart(&summary.cycles, tolerance, live.is_some(), language)),
-        (Piece::Control, control(live.is_some() && !has_control, language)),
-    ]
-    .map(|(piece, markup)| (piece, markup.into_string()))
-}
 
 /// Returns the state of a run as JSON for the scripts of the page. `seen` is the current status of the run. `session`
 /// decides which orders are allowed. `has_control` is true if the browser has control of the cell, or if no browser has
@@ -93,6 +42,7 @@ pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) ->
             })
         })
         .collect();
+    let tolerance = seen.summary.tolerance.as_ref();
     let progress = live.and_then(|live| live.progress);
     let measures = progress.filter(|progress| progress.device == Device::Cmm);
     json!({
@@ -105,6 +55,7 @@ pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) ->
         "can": live.map_or_else(Vec::new, |live| can(live, session, has_control)),
         "cycle": live.map(|live| live.cycle),
         "cycles": cycles,
+        "toleranceUm": tolerance.map(|tolerance| 1e3 * tolerance.pv_mm).filter(|um| um.is_finite()),
         "touched": measures.map(|progress| [progress.done, progress.total]),
         "alarms": live.map_or(0, |live| live.alarms.len()),
         "verdict": verdict(seen),
@@ -118,6 +69,10 @@ fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static st
     let mut can = vec!["hold", "stop", "abort"];
     if is_over(live.state) {
         can.clear();
+    }
+    // The next order is RESUME: a HOLD changes nothing now.
+    if matches!(live.state, StateName::Holding | StateName::Held) {
+        can.retain(|order| *order != "hold");
     }
     if has_control && live.state == StateName::Held {
         can.push("resume");
@@ -139,292 +94,6 @@ fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static st
     }
     can.retain(|order| session.may(order));
     can
-}
-
-fn is_over(state: StateName) -> bool {
-    matches!(state, StateName::Stopped | StateName::Aborted | StateName::Complete)
-}
-
-/// Returns the HTML of the banner of a run. The banner shows one word with a shape and a colour, and can be read from a
-/// distance of two metres. `seen` is the current status of the run. The word is the state of the cell while the run is
-/// active, and the result of the run afterwards. If the run has no end and its program does not answer, the word is
-/// "?".
-fn banner(seen: &ObservedRun, language: Language) -> Markup {
-    let say = |text: Text| text.to(language);
-    let mark = |class: &str, shape: &str, word: &str, more: &str| {
-        html! {
-            div .banner .(class) {
-                svg .shape viewBox="0 0 24 24" aria-hidden="true" { path d=(shape) {} }
-                div { strong { (word) } @if !more.is_empty() { span .more { (more) } } }
-                @if seen.summary.simulation { span .simulation { (say(Text::Simulation)) } }
-            }
-        }
-    };
-    let live = seen.snapshot.as_deref().filter(|live| seen.answers && !is_over(live.state));
-    if let Some(live) = live {
-        let phase = live.phase.map_or(String::new(), |phase| say(texts::phase(phase)).to_owned());
-        let not_confirmed = live.unconfirmed.iter().map(|device| format!("{device}?")).collect::<Vec<_>>().join(" ");
-        let cycle = match live.cycle {
-            0 => String::new(),
-            cycle => format!("{} {cycle} {} {}", say(Text::Cycle), say(Text::OfAtMost), live.max_cycles),
-        };
-        let more =
-            [phase, cycle, not_confirmed].into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join(" · ");
-        let (class, shape) = state_symbol(live);
-        return mark(class, shape, say(texts::state(live.state)), &more);
-    }
-    if seen.is_lost() && !seen.summary.run.is_empty() {
-        let gone = if seen.summary.machines_within { Text::SimulationGone } else { Text::ProgramGone };
-        return mark("lost", UNKNOWN, "?", say(gone));
-    }
-    let result = seen.summary.result;
-    let (class, shape) = match result {
-        RunResult::Accepted => ("good", TICK),
-        RunResult::Aborted => ("bad", OCTAGON),
-        RunResult::Open | RunResult::Recovery => ("still", SQUARE),
-        _ => ("bad", CROSS),
-    };
-    // The text of the record begins with the same word.
-    let verdict = &seen.summary.verdict;
-    let reason = verdict.split_once(": ").filter(|(word, _)| word.chars().all(|c| !c.is_lowercase()));
-    mark(class, shape, say(texts::result(result)), reason.map_or(verdict, |(_, reason)| reason))
-}
-
-const PLAY: &str = "M6 3 L21 12 L6 21 Z";
-const PAUSE: &str = "M5 3 H10 V21 H5 Z M14 3 H19 V21 H14 Z";
-const SQUARE: &str = "M4 4 H20 V20 H4 Z";
-const OCTAGON: &str = "M8 2 H16 L22 8 V16 L16 22 H8 L2 16 V8 Z";
-const TICK: &str = "M2 13 L9 20 L22 6 L19 3 L9 14 L5 10 Z";
-const CROSS: &str = "M4 7 L7 4 L12 9 L17 4 L20 7 L15 12 L20 17 L17 20 L12 15 L7 20 L4 17 L9 12 Z";
-const TRIANGLE: &str = "M12 2 L23 21 H1 Z";
-const UNKNOWN: &str = "M12 2 L22 12 L12 22 L2 12 Z";
-
-/// Returns the CSS class (colour) and the SVG path (shape) for the state of the cell.
-fn state_symbol(live: &Snapshot) -> (&'static str, &'static str) {
-    use StateName as S;
-    match live.state {
-        S::Aborting | S::Aborted => ("bad", OCTAGON),
-        _ if !live.alarms.is_empty() || !live.unconfirmed.is_empty() => ("alarm", TRIANGLE),
-        S::Execute
-            if matches!(
-                live.next_step,
-                NextStep::Load | NextStep::SeeClear { .. } | NextStep::AtMachine { .. } | NextStep::Bring { .. }
-            ) =>
-        {
-            ("asks", TRIANGLE)
-        }
-        S::Execute | S::Starting | S::Unholding | S::Unsuspending | S::Completing => ("runs", PLAY),
-        S::Held | S::Holding | S::Suspending | S::Suspended => ("held", PAUSE),
-        _ => ("still", SQUARE),
-    }
-}
-
-fn about(seen: &ObservedRun, language: Language) -> Markup {
-    let RunSummary { run, part, name, recipe, operator, began, ended, .. } = &*seen.summary;
-    let say = |text: Text| text.to(language);
-    html! {
-        dl {
-            dt { (say(Text::Part)) } dd { strong { (part) } " " (name) }
-            dt { (say(Text::Recipe)) } dd { (recipe) }
-            dt { (say(Text::Operator)) } dd { (operator) }
-            dt { (say(Text::Began)) } dd { (when(began)) }
-            @if let Some(ended) = ended { dt { (say(Text::Ended)) } dd { (when(ended)) } }
-            dt { (say(Text::Run)) } dd .id { (run) }
-        }
-    }
-}
-
-/// Returns a time of the record, such as `2026-03-01T12:00:00.5Z`, as `2026-03-01 12:00:00 UTC`.
-fn when(utc: &str) -> String {
-    let second: String = utc.chars().take(19).collect();
-    if second.is_empty() { second } else { format!("{} UTC", second.replacen('T', " ", 1)) }
-}
-
-/// Returns the HTML that tells a person what to do next, with the buttons for this. If the program of the run no longer
-/// answers, there are no buttons. Then the text says to read the report if the run has ended, and otherwise the HTML is
-/// empty.
-fn next(seen: &ObservedRun, language: Language) -> Markup {
-    let say = |text: Text| text.to(language);
-    let Some(live) = seen.snapshot.as_deref().filter(|_| seen.answers) else {
-        // For a lost run the banner already says what to do.
-        return html! { @if !seen.is_lost() { p .sentence { (say(Text::ReadReport)) } } };
-    };
-    if let (NextStep::AtMachine { device }, Some(step)) = (&live.next_step, &live.operator_step) {
-        let run = format!("/runs/{}", in_path(&seen.summary.run));
-        return html! {
-            (operator_step::card(step, *device, &run, language))
-            (waits(live, language))
-        };
-    }
-    let (sentence, device) = texts::next(&live.next_step, language);
-    let named = device.map(|device| device.to_string().to_lowercase());
-    html! {
-        p .sentence { (sentence) @if let Some(device) = device { " " strong { (device) } } }
-        @match &live.next_step {
-            NextStep::Load => { button type="button" data-order="loaded" { (say(Text::Loaded)) } }
-            NextStep::SeeClear { device } => {
-                button type="button" data-order="clear" data-device=(named.unwrap_or_default()) { (device) " " (say(Text::IsClear)) }
-            }
-            NextStep::SeeWhetherItStands { .. } => {
-                label { (say(Text::WhatYouSaw)) input id="evidence" type="text" maxlength="300" autocomplete="off"; }
-                button type="button" data-order="over" data-device=(named.unwrap_or_default()) { (say(Text::DeclareOver)) }
-            }
-            _ => {}
-        }
-        @if let Some(phase) = live.phase.filter(|_| live.state == StateName::Held) {
-            @let (first, device) = texts::on_resume(phase);
-            p .first { (say(Text::FirstThing)) " " @if let Some(device) = device { (device) ": " } (say(first)) }
-        }
-        (waits(live, language))
-    }
-}
-
-/// Returns the HTML of what the machine of the current job waits for.
-fn waits(live: &Snapshot, language: Language) -> Markup {
-    html! { @for waits in &live.waits_for { p .quiet { (Text::Waits.to(language)) ": " (waits) } } }
-}
-
-/// Returns the HTML of the progress of the current job (work of one machine, such as grinding or measuring). The HTML
-/// is empty if no job runs.
-fn job(live: &Snapshot, language: Language) -> Markup {
-    let Some(JobProgress { device, done, total, remaining_s }) = live.progress else {
-        return Markup::default();
-    };
-    let percent = 100.0 * f64::from(done.min(total)) / f64::from(total.max(1));
-    let unit = if device == Device::Cmm { format!(" {done}/{total}") } else { String::new() };
-    html! {
-        p .phase {
-            span { (device) " " (live.phase.map_or("", |phase| texts::phase(phase).to(language))) (unit) }
-            strong { (format!("{percent:.0} %")) }
-            @if let Some(left) = remaining_s { span .left { (range(left)) " " (Text::TimeLeft.to(language)) } }
-        }
-        progress max=(total.max(1)) value=(done) aria-label=(device) {}
-        @if let Some(PreviewStatistics { touch_count, rms_um, min_um, max_um }) = live.preview {
-            p .quiet title=(Text::PreliminaryMeans.to(language)) {
-                (Text::PreliminaryPoints.to(language)) ": " (touch_count) " " (Text::Touched.to(language))
-                (format!(", RMS {rms_um:.2} µm, min {min_um:+.2} µm, max {max_um:+.2} µm"))
-            }
-        }
-    }
-}
-
-/// Formats a range of durations as text, such as `5 – 8 min`. The input is the minimum and the maximum in seconds. The
-/// maximum decides the unit: seconds below 90 s, minutes below 90 min, otherwise hours. If both numbers look the same,
-/// the text contains only one.
-fn range([least, most]: [f64; 2]) -> String {
-    let (unit, per) = match most {
-        most if most < 90.0 => ("s", 1.0),
-        most if most < 5400.0 => ("min", 60.0),
-        _ => ("h", 3600.0),
-    };
-    let digits = usize::from(unit == "h");
-    let [least, most] = [least, most].map(|seconds| format!("{:.digits$}", seconds / per));
-    if least == most { format!("{most} {unit}") } else { format!("{least} – {most} {unit}") }
-}
-
-/// Returns the HTML of the alarms of a run. `seen` is the current status of the run. While the run is active and its
-/// program answers, the result contains the active alarms. Otherwise it contains all alarms on record, with the times
-/// at which they were raised and withdrawn.
-fn alarms(seen: &ObservedRun, language: Language) -> Markup {
-    let say = |text: Text| text.to(language);
-    if let Some(live) = seen.snapshot.as_deref().filter(|live| seen.answers && !is_over(live.state)) {
-        return html! {
-            @if live.alarms.is_empty() { p .quiet { (say(Text::NoAlarm)) } }
-            @for alarm in &live.alarms { (standing(alarm, language)) }
-        };
-    }
-    let told = &seen.summary.alarms;
-    html! {
-        @if told.is_empty() && !seen.summary.run.is_empty() { p .quiet { (say(Text::NoAlarmRaised)) } }
-        @for AlarmHistory { alarm, raised, withdrawn } in told {
-            @if withdrawn.is_none() && seen.is_lost() {
-                (standing(alarm, language))
-            } @else {
-                article .alarm .past {
-                    h3 { (alarm_texts(alarm, language).event) }
-                    p .quiet {
-                        (say(Text::Raised)) " " (when(raised)) ", "
-                        @match withdrawn {
-                            Some(withdrawn) => { (say(Text::Withdrawn)) " " (when(withdrawn)) }
-                            None => { (say(Text::StoodAtTheEnd)) }
-                        }
-                    }
-                }
-            }
-        }
-    }
-}
-
-/// Returns the HTML of the active alarm `alarm`: its cause, its consequence, its remedy, and who can clear it.
-fn standing(alarm: &Alarm, language: Language) -> Markup {
-    let (say, said) = (|text: Text| text.to(language), alarm_texts(alarm, language));
-    html! {
-        article .alarm {
-            h3 { (said.event) }
-            p { (said.consequence) }
-            p .quiet { (say(Text::WhatToDo)) ":" }
-            ol { @for remedy in &said.remedy { li { (remedy) } } }
-            p .quiet { (say(Text::ClearedBy)) ": " (say(match alarm.cleared_by {
-                Role::Nobody => Text::ByItself,
-                Role::Operator => Text::ByOperator,
-                _ => Text::ByEngineer,
-            })) }
-        }
-    }
-}
-
-/// Returns the HTML table of the measured form errors. Each cycle has one row with its PV and RMS, their uncertainties
-/// U (all in micrometres), and its verdict. A cycle without a measurement shows dashes. If `tolerance` is given, one
-/// more row contains the limits.
-fn figures(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, language: Language) -> Markup {
-    let say = |text: Text| text.to(language);
-    let limit = |mm: f64| if mm.is_finite() { format!("{:.2}", 1e3 * mm) } else { "–".to_owned() };
-    html! {
-        table {
-            tr {
-                th .n { (say(Text::Cycle)) }
-                th .n { "PV, µm" } th .n { "± U" } th .n { "RMS, µm" } th .n { "± U" } th { (say(Text::Judged)) }
-            }
-            @for of in cycles {
-                tr {
-                    td .n { (of.cycle) }
-                    @match of.figures {
-                        Some([[pv, pv_u], [rms, rms_u]]) => {
-                            td .n { strong { (format!("{pv:.2}")) } } td .n { (format!("{pv_u:.2}")) }
-                            td .n { strong { (format!("{rms:.3}")) } } td .n { (format!("{rms_u:.3}")) }
-                        }
-                        None => { @for _ in 0..4 { td .n { "–" } } }
-                    }
-                    td title=(of.reason) { (of.verdict.as_deref().unwrap_or(&of.reason)) }
-                }
-            }
-            @if let Some(tolerance) = tolerance {
-                tr .limit {
-                    td .n { (say(Text::Limit)) }
-                    td .n { (limit(tolerance.pv_mm)) } td {} td .n { (limit(tolerance.rms_mm)) } td {} td {}
-                }
-            }
-        }
-        @for (cycle, places) in cycles.iter().filter_map(|of| Some((of.cycle, of.left_out.as_ref()?))) {
-            p { strong { (say(Text::LeftOut)) ", " (say(Text::Cycle)) " " (cycle) ": " } (places) }
-        }
-        p .quiet { "U: " (say(Text::Uncertainty)) }
-    }
-}
-
-fn control(is_elsewhere: bool, language: Language) -> Markup {
-    html! {
-        @if is_elsewhere {
-            p { (Text::ControlElsewhere.to(language)) }
-            button type="button" data-order="control" { (Text::TakeControl.to(language)) }
-        }
-    }
-}
-
-/// Percent-encodes the name of a run for use in a URL, because a folder can have any name.
-fn in_path(run: &str) -> String {
-    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-._~".contains(&byte);
-    run.bytes().map(|byte| if is_plain(byte) { char::from(byte).to_string() } else { format!("%{byte:02X}") }).collect()
 }
 
 /// Serves the page of the active run, or of the last run if none is active.
@@ -464,7 +133,7 @@ pub(crate) async fn run(
 /// browser has control of the cell, or if no browser has control.
 fn cell(seen: &ObservedRun, id: &str, session: &Session, has_control: bool, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
-    let made = pieces(seen, has_control || !session.may("control"), language);
+    let made = run_pieces(seen, has_control || !session.may("control"), language);
     let piece = |piece: Piece| {
         let html = made.iter().find(|(made, _)| *made == piece).map_or("", |(_, html)| html);
         maud::PreEscaped(html.to_owned())
@@ -474,28 +143,33 @@ fn cell(seen: &ObservedRun, id: &str, session: &Session, has_control: bool, lang
     html! {
         a .skip href="#orders" { (say(Text::SkipToOrders)) }
         div #old role="alert" hidden {}
-        section #banner aria-live="polite" { (piece(Piece::Banner)) }
+        header #banner aria-live="polite" { (piece(Piece::Banner)) }
         main .cell data-run=(id) {
-            section #next aria-live="polite" aria-label=(say(Text::NextAction)) { (piece(Piece::Next)) }
-            section #job aria-label=(say(Text::TimeLeft)) { (piece(Piece::Job)) }
-            section .map aria-label=(say(Text::Map)) { (map(language)) }
-            section .side {
-                h2 { (say(Text::Alarms)) }
-                div #alarms aria-live="assertive" { (piece(Piece::Alarms)) }
-                h2 { (say(Text::Convergence)) }
-                div #convergence { (piece(Piece::Convergence)) }
-                h2 { (say(Text::Figures)) }
-                div #figures { (piece(Piece::Figures)) }
-                div #about { (piece(Piece::About)) }
-                p { a href=(format!("/runs/{}/report", in_path(id))) { (say(Text::Report)) } }
+            section .flow {
+                div #steps aria-label=(say(Text::StepsOfCycle)) role="group" { (piece(Piece::Steps)) }
+                div #next role="group" aria-live="polite" aria-label=(say(Text::NextAction)) { (piece(Piece::Next)) }
+            }
+            section .card .map aria-label=(say(Text::Map)) { (map(language)) }
+            div .column {
+                section .card .of-alarms { h2 { (say(Text::Alarms)) } div #alarms aria-live="assertive" { (piece(Piece::Alarms)) } }
+                section .card { h2 { (say(Text::LastJudged)) } div #judged { (piece(Piece::Judged)) } }
+                section .card { h2 { (say(Text::Convergence)) } div #convergence { (piece(Piece::Convergence)) } }
+                section .card { h2 { (say(Text::Cycles)) } div #cycles { (piece(Piece::Cycles)) } }
+                section .card {
+                    h2 { (say(Text::ThisRun)) }
+                    div #about { (piece(Piece::About)) }
+                    p { a href=(format!("/runs/{}/report", in_path(id))) { (say(Text::Report)) } }
+                }
             }
         }
         section #orders .orders {
             button .hold type="button" data-order="hold" disabled { (say(Text::Hold)) }
             button .resume type="button" data-order="resume" disabled { (say(Text::Resume)) }
             button .stop type="button" data-order="stop" disabled { (say(Text::Stop)) }
-            div #control { (piece(Piece::Control)) }
-            p #answer role="status" { (say(Text::NoButtonStops)) }
+            div .said {
+                p #control { (piece(Piece::Control)) }
+                p #answer role="status" { (say(Text::NoButtonStops)) }
+            }
             button .abort type="button" data-order="abort" disabled { (say(Text::Abort)) }
         }
         script #data type="application/json" { (maud::PreEscaped(harmless(&data))) }
@@ -510,17 +184,26 @@ fn harmless(data: &Value) -> String {
 fn map(language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     html! {
-        div .tools role="group" {
-            button type="button" data-view="map" aria-pressed="true" { (say(Text::Map)) }
-            button type="button" data-view="difference" aria-pressed="false" { (say(Text::Difference)) }
-            button type="button" data-view="sigma" aria-pressed="false" { (say(Text::Sigma)) }
-            button type="button" data-view="relief" aria-pressed="false" { (say(Text::Relief)) }
-            button type="button" data-points aria-pressed="false" { (say(Text::Points)) }
+        div .tools role="group" aria-label=(say(Text::Map)) {
+            div .views {
+                button type="button" data-view="map" aria-pressed="true" { (say(Text::Map)) }
+                button type="button" data-view="difference" aria-pressed="false" { (say(Text::Difference)) }
+                button type="button" data-view="sigma" aria-pressed="false" { (say(Text::Sigma)) }
+                button type="button" data-view="relief" aria-pressed="false" { (say(Text::Relief)) }
+                button type="button" data-points aria-pressed="false" { (say(Text::Points)) }
+            }
+            label { (say(Text::Scale)) " "
+                select #scale {
+                    option value="first" { (say(Text::ScaleOfFirst)) }
+                    option value="own" { (say(Text::ScaleOfMap)) }
+                    option value="tolerance" { (say(Text::ScaleOfTolerance)) }
+                }
+            }
             label { (say(Text::Cycle)) " " select #cycle {} }
         }
         canvas #map tabindex="0" role="img" aria-label=(say(Text::MapHelp)) {}
         canvas #relief tabindex="0" role="img" aria-label=(say(Text::MapHelp)) hidden {}
-        output #reading {}
+        div .foot { output #caption {} output #reading {} }
         canvas #histogram role="img" aria-label=(say(Text::Histogram)) {}
     }
 }
@@ -532,6 +215,7 @@ fn script_texts(language: Language) -> Value {
         "noData": say(Text::NotConnected), "pageGone": say(Text::PageGone), "programGone": say(Text::ProgramGone), "simulationGone": say(Text::SimulationGone),
         "noRelief": say(Text::NoRelief), "notMeasured": say(Text::NotMeasured), "planned": say(Text::Planned),
         "touched": say(Text::Touched), "filtered": say(Text::Filtered), "known": say(Text::KnownTo), "order": say(Text::NoButtonStops),
+        "sign": say(Text::SignOfMap), "noCycleBefore": say(Text::NoCycleBefore), "plan": say(Text::PlanShown), "points": say(Text::Points),
     })
 }
 
@@ -619,15 +303,16 @@ fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> M
     html! {
         table {
             tr {
-                th {} th { (say(Text::Run)) } th { (say(Text::Part)) } th { (say(Text::Recipe)) } th { (say(Text::Began)) }
-                th .n { (say(Text::Cycle)) } th .n { "PV, µm" } th .n { "RMS, µm" } th .n { (say(Text::Alarms)) } th { (say(Text::Result)) }
+                th {} th { (say(Text::Part)) } th { (say(Text::Recipe)) } th { (say(Text::Began)) }
+                th .n { (say(Text::Cycle)) } th .n { "PV, µm" } th .n { "RMS, µm" } th .n { (say(Text::Alarms)) } th { (say(Text::Result)) } th { (say(Text::Run)) }
             }
             @for Listed { id, is_live, summary } in runs {
                 @let figures = summary.cycles.iter().rev().find_map(|of| of.figures);
                 tr {
                     td { input type="checkbox" name="run" value=(id) aria-label=(id); }
-                    td { a href=(format!("/runs/{}", in_path(id))) { (id) } }
-                    td { (summary.part) } td { (summary.recipe) } td { (when(&summary.began)) }
+                    @let address = format!("/runs/{}", in_path(id));
+                    td { a href=(address) { @if summary.part.is_empty() { (summary.name) } @else { (summary.part) } } }
+                    td { (summary.recipe) } td { (when(&summary.began)) }
                     td .n { (summary.cycles.len()) }
                     @for k in 0..2 {
                         td .n { @if let Some(figures) = figures { (format!("{:.2}", figures[k][0])) } @else { "–" } }
@@ -636,6 +321,7 @@ fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> M
                     td class=(if summary.result == RunResult::Accepted { "good" } else { "" }) {
                         @if *is_live { strong { (say(Text::Live)) } } @else { (say(texts::result(summary.result))) }
                     }
+                    td .id { a href=(address) { (id) } }
                 }
             }
         }
@@ -671,12 +357,17 @@ pub(crate) async fn compare(
                 section data-compared=(id) {
                     h2 { a href=(format!("/runs/{}", in_path(id))) { (id) } }
                     (banner(&seen, language))
+                    p .quiet { (verdict_reason(summary)) }
                     canvas role="img" aria-label=(say(Text::Map)) {}
                     (chart(&summary.cycles, tolerance, false, language))
                     (figures(&summary.cycles, tolerance, language))
                     (about(&seen, language))
                 }
             }
+        }
+        figure .difference .card {
+            figcaption { (say(Text::DifferenceOfRuns)) ": " strong { (found[1].0) } " − " strong { (found[0].0) } }
+            canvas #difference role="img" aria-label=(say(Text::DifferenceOfRuns)) {}
         }
         @let maps: Vec<_> = found.iter().map(|(id, summary)| {
             json!({ "run": id, "cycle": summary.cycles.iter().rev().find(|of| of.map.is_some()).map(|of| of.cycle) })
@@ -836,6 +527,7 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
             }
             body {
                 nav {
+                    span .brand { "Regrind" }
                     @match kind.subject() {
                         PageSubject::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } }
                         PageSubject::Plant => {

@@ -49,7 +49,7 @@ use regrind_formats::{FormatError, write_atomic};
 pub use regrind_journal::{Stamp as RecordStamp, has_record, stamp as record_stamp};
 pub use results_file::{ResultsFormat, run_results, write_run_results};
 pub use run::{run_report, write_run_report};
-pub use run_history::AlarmHistory;
+pub use run_history::{AlarmHistory, HoldOrder};
 pub use states::state_picture;
 pub use summary::{CycleSummary, RunResult, RunSummary, run_summary};
 use thiserror::Error;

@@ -102,6 +102,17 @@ pub struct AlarmHistory {
     pub withdrawn: Option<String>,
 }
 
+/// Order of a person to hold the cell.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct HoldOrder {
+    /// Name of the person.
+    pub by: String,
+    /// Time of the order, RFC 3339 in UTC.
+    pub at: String,
+    /// Reason in this person's words; empty if none was given.
+    pub reason: String,
+}
+
 /// Order of a person, or confirmation of the state of a machine.
 pub(super) struct Order {
     pub(super) record: Record,
@@ -168,6 +179,14 @@ impl RunHistory {
             | Content::Seal(_)
             | Content::Unknown(_) => {}
         }
+    }
+
+    /// Returns the last accepted order to hold the cell, if no accepted order to resume it followed.
+    pub(super) fn hold_order(&self) -> Option<HoldOrder> {
+        let accepted = self.orders.iter().filter(|order| order.refused.is_none());
+        let last = accepted.rev().find(|of| matches!(of.event, Some(Event::Hold { .. } | Event::Resume { .. })))?;
+        let Some(Event::Hold { actor, reason }) = &last.event else { return None };
+        Some(HoldOrder { by: actor.name.clone(), at: last.record.utc.clone(), reason: reason.clone() })
     }
 
     fn add_command(&mut self, record: Record, command: Command) {

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::ReportError;
-use super::run_history::{AlarmHistory, CycleHistory, RunHistory};
+use super::run_history::{AlarmHistory, CycleHistory, HoldOrder, RunHistory};
 use super::words::{ending_words, home_words, verdict_words};
 use regrind_cell::{Ending, Tolerance};
 use regrind_journal::{Reader, Record};
@@ -48,6 +48,10 @@ pub struct RunSummary {
     pub wheel_radius_mm: Option<f64>,
     /// Last error of the probe's radius on the reference sphere, in micrometres.
     pub probe_off_um: Option<f64>,
+    /// Cycle of the pass that was started last; `None` before the first pass.
+    pub pass_cycle: Option<u32>,
+    /// Last order of a person to hold the cell; `None` if there is none, or if the cell was resumed since.
+    pub hold: Option<HoldOrder>,
 }
 
 /// Result of a run.
@@ -145,6 +149,8 @@ fn summary(story: &RunHistory) -> RunSummary {
         machines: story.machines.clone().map(|machine| machine.map(|[name, _]| name)),
         wheel_radius_mm: story.wheel_radius_mm,
         probe_off_um: story.radius_error_mm.map(|(_, mm)| 1e3 * mm),
+        pass_cycle: story.pass.map(|pass| pass.cycle),
+        hold: story.hold_order(),
     }
 }
 

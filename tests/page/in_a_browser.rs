@@ -258,7 +258,7 @@ fn pictures_are_made() {
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&shown.url, [1180, 780]);
     tab.until(&mut browser, "document.querySelectorAll('#cycle option').length > 0");
-    tab.until(&mut browser, "document.querySelector('progress') && document.querySelector('progress').value > 300");
+    tab.until(&mut browser, "document.querySelector('.steps .now progress')?.value > 300");
     let picture = |tab: &Tab, browser: &mut Browser, name: &str| {
         // Wait for the last bytes to be painted. The picture is checked before it is kept.
         std::thread::park_timeout(std::time::Duration::from_secs(1));

@@ -27,6 +27,24 @@ const regrindMap = (() => {
     return { limit: limit || 1, count, rms: Math.sqrt(squares / Math.max(count, 1)), pv: count ? high - low : 0 };
   }
 
+  /** The smallest round number that is not below a limit: neighbouring maps then often have the same scale. */
+  function roundLimit(limit) {
+    const decade = 10 ** Math.floor(Math.log10(limit));
+    return [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10].map((k) => k * decade).find((round) => round >= 0.999 * limit) || limit;
+  }
+
+  /** The nodes of the lowest and of the highest value. */
+  function extremes({ values, columns, firstX, firstY, stepX, stepY }) {
+    let [low, high] = [-1, -1];
+    for (let k = 0; k < values.length; k += 1) {
+      if (Number.isNaN(values[k])) continue;
+      if (low < 0 || values[k] < values[low]) low = k;
+      if (high < 0 || values[k] > values[high]) high = k;
+    }
+    const at = (k) => ({ value: values[k], at: [firstX + (k % columns) * stepX, firstY + Math.floor(k / columns) * stepY] });
+    return low < 0 ? [] : [low, high].map(at);
+  }
+
   /** 255 colours from below to above, out of hexadecimal digits. */
   function readColours(text) {
     const colours = new Uint8Array(text.length / 2);
@@ -57,6 +75,8 @@ const regrindMap = (() => {
     return { ...now, values };
   }
 
+  const local = (value, digits) => value.toLocaleString(document.documentElement.lang, { minimumFractionDigits: digits, maximumFractionDigits: digits });
+
   /** Round steps over a range, some five of them. */
   function ticks(low, high) {
     const rough = (high - low) / 5;
@@ -64,7 +84,7 @@ const regrindMap = (() => {
     const step = [1, 2, 5, 10].map((k) => k * decade).find((s) => s >= rough) || decade;
     const found = [];
     for (let tick = Math.ceil(low / step) * step; tick <= high + 1e-9 * step; tick += step) found.push(tick);
-    return found.map((tick) => [tick, Number(tick.toPrecision(6)).toString().replace("-", "−")]);
+    return found.map((tick) => [tick, Number(tick.toPrecision(6)).toLocaleString(document.documentElement.lang, { maximumFractionDigits: 6 }).replace("-", "−")]);
   }
 
   /** Makes a canvas as fine as the screen, and returns its context and its size in the pixels of the page. */
@@ -111,14 +131,28 @@ const regrindMap = (() => {
     return [x0 - margin, y0 - margin, x1 + margin, y1 + margin];
   }
 
+  /** The bounds that hold all of some maps. */
+  function frameOf(grids) {
+    const all = grids.map((grid) => bounds(grid, []));
+    return all.length ? [0, 1, 2, 3].map((k) => Math[k < 2 ? "min" : "max"](...all.map((of) => of[k]))) : null;
+  }
+
   /** Draws a map with its axes and its bar; returns how places on the page and on the part belong together. */
-  function draw(canvas, { grid, limit, colours, dots, mark, key }) {
+  function draw(canvas, { grid, limit, colours, dots, mark, missing, most, frame }) {
+    const isEmpty = !grid && !(dots && dots.length);
+    const [x0, y0, x1, y1] = isEmpty ? [0, 0, 1.6, 1] : frame || bounds(grid, (dots || []).map((dot) => dot.at));
+    const [left, right, top, bottom] = [46, grid ? 84 : 12, 8, 38];
+    // The canvas is as high as the part needs at this width, but not higher than the screen allows.
+    const wanted = ((canvas.clientWidth - left - right) * (y1 - y0)) / (x1 - x0) + top + bottom;
+    if (most) canvas.style.height = `${Math.round(Math.min(Math.max(wanted, 200), most))}px`;
     const { context, width, height, ink, quiet, ground } = prepared(canvas);
     context.fillStyle = ground;
     context.fillRect(0, 0, width, height);
-    if (!grid && !(dots && dots.length)) return null;
-    const [x0, y0, x1, y1] = bounds(grid, (dots || []).map((dot) => dot.at));
-    const [left, right, top, bottom] = [46, grid ? 84 : 12, 8, 38];
+    if (isEmpty) {
+      [context.fillStyle, context.textAlign] = [quiet, "center"];
+      context.fillText(missing || "", width / 2, height / 2);
+      return null;
+    }
     const scale = Math.min((width - left - right) / (x1 - x0), (height - top - bottom) / (y1 - y0));
     const [w, h] = [scale * (x1 - x0), scale * (y1 - y0)];
     const offset = left + Math.max(0, (width - left - right - w) / 2);
@@ -128,8 +162,10 @@ const regrindMap = (() => {
       toPart: (px, py) => [x0 + (px - offset) / scale, y0 + (top + h - py) / scale],
     };
     if (grid) {
-      context.imageSmoothingEnabled = w / grid.columns < 4;
-      context.drawImage(picture(grid, limit, colours), offset, top, w, h);
+      context.imageSmoothingQuality = "high";
+      const [gx0, gy0, gx1, gy1] = bounds(grid, []);
+      const [[px, py], [qx, qy]] = [view.toPage(gx0, gy1), view.toPage(gx1, gy0)];
+      context.drawImage(picture(grid, limit, colours), px, py, qx - px, qy - py);
     }
     if (dots && dots.length > MOST_DISCS) blocks(context, view, dots, [offset, top, w, h]);
     else discs(context, view, dots || [], { ground, ink, quiet });
@@ -137,10 +173,7 @@ const regrindMap = (() => {
     context.strokeRect(offset, top, w, h);
     axes(context, view, { x0, y0, x1, y1, offset, top, w, h, ink });
     if (grid) bar(context, { limit, low: grid.low, colours, x: offset + w + 14, top, h, ink });
-    if (key) {
-      context.fillStyle = quiet;
-      context.fillText(key, offset, height - 4);
-    }
+    if (grid && grid.low < 0) marks(context, view, extremes(grid), { offset, w, ink, ground });
     if (mark) {
       const [px, py] = view.toPage(...mark);
       for (const [colour, thick] of [[ground, 3], [ink, 1]]) {
@@ -154,6 +187,29 @@ const regrindMap = (() => {
       }
     }
     return view;
+  }
+
+  /** The lowest and the highest value, each with a cross and its number. */
+  function marks(context, view, found, { offset, w, ink, ground }) {
+    for (const { value, at } of found) {
+      const [px, py] = view.toPage(...at);
+      const text = `${value < 0 ? "−" : "+"}${local(Math.abs(value), 2)}`;
+      const isRight = px > offset + w - 60;
+      [context.textAlign, context.lineJoin] = [isRight ? "right" : "left", "round"];
+      for (const [colour, thick] of [[ground, 4], [ink, 1.5]]) {
+        [context.strokeStyle, context.lineWidth] = [colour, thick];
+        context.beginPath();
+        for (const [dx, dy] of [[4, 4], [4, -4]]) {
+          context.moveTo(px - dx, py - dy);
+          context.lineTo(px + dx, py + dy);
+        }
+        context.stroke();
+        if (colour === ground) context.strokeText(text, px + (isRight ? -8 : 8), py + 4);
+      }
+      context.fillStyle = ink;
+      context.fillText(text, px + (isRight ? -8 : 8), py + 4);
+    }
+    context.textAlign = "left";
   }
 
   /** Points as discs; those of no colour are hollow. */
@@ -251,5 +307,5 @@ const regrindMap = (() => {
     context.fillText("µm", left + wide + 8, height - 5);
   }
 
-  return { readGrid, readColours, statistics, difference, draw, histogram, level };
+  return { readGrid, readColours, statistics, roundLimit, difference, frameOf, draw, histogram, level };
 })();

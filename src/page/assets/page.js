@@ -28,10 +28,16 @@
   async function compare() {
     const grids = await Promise.all(data.compared.map(({ run, cycle }) => (cycle ? mapOf(run, cycle) : null)));
     // One scale for both: else the worse looks like the better.
-    const limit = Math.max(...grids.map((grid) => (grid ? regrindMap.statistics(grid.values).limit : 0))) || 1;
-    const paint = () => document.querySelectorAll(".compare section").forEach((section, k) => {
-      regrindMap.draw(section.querySelector("canvas"), { grid: grids[k], limit, colours });
-    });
+    const limit = regrindMap.roundLimit(Math.max(...grids.map((grid) => (grid ? regrindMap.statistics(grid.values).limit : 0))) || 1);
+    const frame = regrindMap.frameOf(grids.filter(Boolean));
+    const both = grids.every(Boolean) ? regrindMap.difference(grids[1], grids[0]) : null;
+    const own = both ? regrindMap.roundLimit(regrindMap.statistics(both.values).limit) : 1;
+    const paint = () => {
+      document.querySelectorAll(".compare section").forEach((section, k) => {
+        regrindMap.draw(section.querySelector("canvas"), { grid: grids[k], limit, colours, frame, missing: texts.notMeasured, most: Math.max(240, 0.48 * innerHeight) });
+      });
+      regrindMap.draw(element("difference"), { grid: both, limit: own, colours, frame, missing: texts.notMeasured, most: Math.max(240, 0.48 * innerHeight) });
+    };
     paint();
     addEventListener("resize", paint);
     document.addEventListener("regrind-theme", paint);
@@ -62,6 +68,7 @@
     const typed = element("evidence") && holder.contains(element("evidence")) ? element("evidence").value : null;
     const chosen = element("result-file") && holder.contains(element("result-file")) ? element("result-file") : null;
     holder.innerHTML = html;
+    regrindTimes(holder);
     if (chosen && element("result-file")) element("result-file").replaceWith(chosen);
     if (typed !== null && element("evidence")) element("evidence").value = typed;
     if (focused) (holder.querySelector(`[data-order="${focused}"]`) || element(focused) || holder).focus?.();
@@ -148,7 +155,7 @@
 
   // ---- the map ----
 
-  const [canvas, relief, reading, cycles] = ["map", "relief", "reading", "cycle"].map(element);
+  const [canvas, relief, reading, caption, cycles, scales] = ["map", "relief", "reading", "caption", "cycle", "scale"].map(element);
   let view = "map";
   let withPoints = false;
   let chosen = null;
@@ -167,6 +174,7 @@
     event.currentTarget.setAttribute("aria-pressed", String(withPoints));
     update();
   });
+  scales.addEventListener("change", update);
   cycles.addEventListener("change", () => {
     chosen = cycles.value === "" ? null : Number(cycles.value);
     update();
@@ -196,39 +204,35 @@
     }
   }
 
+  /** The difference of a cycle has a scale of its own: nothing else is comparable with it. */
+  async function limitOf(grid, mapped) {
+    const own = regrindMap.roundLimit(regrindMap.statistics(grid.values).limit);
+    if (view === "sigma" || view === "difference" || scales.value === "own") return own;
+    if (scales.value === "tolerance") return state.toleranceUm ? state.toleranceUm / 2 : own;
+    const first = await mapOf(run, mapped[0].cycle, mapped[0].map);
+    return first ? regrindMap.roundLimit(regrindMap.statistics(first.values).limit) : own;
+  }
+
   async function make() {
     const mapped = state.cycles.filter((of) => of.map);
     const at = mapped.findIndex((of) => String(of.cycle) === cycles.value);
     let grid = at < 0 ? null : await mapOf(run, mapped[at].cycle, mapped[at].map);
+    let missing = texts.notMeasured;
     if (grid && view === "difference") {
       const before = at > 0 ? await mapOf(run, mapped[at - 1].cycle, mapped[at - 1].map) : null;
       grid = before && regrindMap.difference(grid, before);
+      missing = texts.noCycleBefore;
     }
     if (grid && view === "sigma") grid = { ...grid, values: grid.sigma, low: 0 };
-    const { limit } = grid ? regrindMap.statistics(grid.values) : { limit: 1 };
-    return { grid, limit, ...await dotsOver(grid, limit, at < 0 ? null : mapped[at]) };
+    const limit = grid ? await limitOf(grid, mapped) : 1;
+    return { grid, limit, missing, ...await dotsOver(grid, limit, at < 0 ? null : mapped[at]) };
   }
 
-  /** The points of the plan while they are touched, or those of the cycle where somebody wants them. */
+  /** The points of the plan until there is a map, or those of the cycle where somebody wants them. */
   async function dotsOver(grid, limit, of) {
-    if (state.touched && view !== "relief" && (!grid || withPoints)) {
-      planned = planned || await bytes(`${base}/planned`);
-      const places = planned ? new Float32Array(planned) : [];
-      const [[done, total], count] = [state.touched, places.length / 2];
-      // Where touches are chosen a job is some of the plan, in an order of its own: what they showed is drawn once it is known.
-      const isChosen = total !== count;
-      if (planned && !(isChosen && grid)) {
-        const ink = getComputedStyle(document.body).color.match(/\d+/g).slice(0, 3).map(Number);
-        const dots = [];
-        for (let k = 0; k < count; k += 1) {
-          const isTouched = !isChosen && k < done;
-          dots.push({ at: [places[2 * k], places[2 * k + 1]], size: isTouched ? 2.6 : 1.4, rgb: isTouched ? ink : null });
-        }
-        const key = isChosen
-          ? `○ ${texts.planned} ${count}   ${texts.touched} ${done} / ${total}`
-          : `● ${texts.touched} ${done}   ○ ${texts.planned} ${count - done}`;
-        return { dots, key };
-      }
+    if (view !== "relief" && view !== "difference" && (state.touched || !grid) && (!grid || withPoints)) {
+      const plan = await dotsOfPlan(Boolean(grid));
+      if (plan) return plan;
     }
     if (withPoints && of && of.points) {
       const buffer = await bytes(`${base}/cycles/${of.cycle}/points?of=${encodeURIComponent(of.points)}`);
@@ -246,43 +250,75 @@
     return {};
   }
 
+  /** The points of the plan: full where they were touched. */
+  async function dotsOfPlan(isOverMap) {
+    planned = planned || await bytes(`${base}/planned`);
+    if (!planned) return null;
+    const places = new Float32Array(planned);
+    const count = places.length / 2;
+    const [done, total] = state.touched || [0, count];
+    // Where touches are chosen, a job has fewer points than the plan, in an order of its own. They are drawn once they are known.
+    const isChosen = total < count;
+    if (isChosen && isOverMap) return null;
+    // The reference sphere is touched before the part.
+    const touched = isChosen ? 0 : Math.max(0, done - (total - count));
+    const ink = getComputedStyle(document.body).color.match(/\d+/g).slice(0, 3).map(Number);
+    const dots = [];
+    for (let k = 0; k < count; k += 1) {
+      const isTouched = k < touched;
+      dots.push({ at: [places[2 * k], places[2 * k + 1]], size: isTouched ? 2.6 : 1.4, rgb: isTouched ? ink : null });
+    }
+    const key = isChosen
+      ? `○ ${texts.planned} ${number(count, 0)}   ${texts.touched} ${number(done, 0)} / ${number(total, 0)}`
+      : `● ${texts.touched} ${number(touched, 0)}   ○ ${texts.planned} ${number(count - touched, 0)}`;
+    return { dots, key };
+  }
+
   let seen = null;
   function paint() {
     if (!current) return;
-    const { grid, limit, dots, key } = current;
+    const { grid, limit, dots, missing } = current;
     const hues = grid && grid.low === 0 ? unsigned : colours;
     const asRelief = view === "relief" && grid;
     if (asRelief && solid === undefined) solid = regrindRelief.prepare(relief);
     const drawnSolid = asRelief && solid;
     [canvas.hidden, relief.hidden] = [Boolean(drawnSolid), !drawnSolid];
     if (drawnSolid) solid.show(grid, limit, colours);
-    else seen = regrindMap.draw(canvas, { grid, limit, colours: hues, dots, mark, key });
+    else seen = regrindMap.draw(canvas, { grid, limit, colours: hues, dots, mark, missing, most: Math.max(280, innerHeight - 400) });
     element("histogram").hidden = !grid;
     if (grid) regrindMap.histogram(element("histogram"), grid, limit, hues);
     read(asRelief && !solid ? texts.noRelief : null);
   }
 
-  /** Says what the map has at the mark, or what it has in all. */
+  /** A number in the language of the page. */
+  const number = (value, digits) => value.toLocaleString(document.documentElement.lang, { minimumFractionDigits: digits, maximumFractionDigits: digits });
+
+  /** Says what the map is, and what it has at the mark, or in all. */
   function read(instead) {
-    const grid = current && current.grid;
+    const { grid, key } = current;
+    caption.textContent = grid
+      ? [`${number(grid.columns * grid.stepX, 0)} × ${number(grid.rows * grid.stepY, 0)} mm`, ...(grid.low < 0 ? [texts.sign] : [])].join(" · ")
+      : key || "";
     if (instead || !grid) {
-      reading.textContent = instead || (current && current.key ? "" : texts.notMeasured);
+      reading.textContent = instead || "";
       return;
     }
-    const { pv, rms, count } = regrindMap.statistics(grid.values);
+    const { pv, rms } = regrindMap.statistics(grid.values);
     const whole = grid.low === 0
-      ? `${texts.known} ${rms.toFixed(3)} µm`
-      : `${texts.filtered} PV ${pv.toFixed(2)} µm, RMS ${rms.toFixed(3)} µm, n = ${count}`;
+      ? `${texts.known} ${number(rms, 3)} µm`
+      : `${texts.filtered} PV ${number(pv, 2)} µm, RMS ${number(rms, 3)} µm`;
     if (!mark) {
       reading.textContent = whole;
       return;
     }
     const [column, row] = [(mark[0] - grid.firstX) / grid.stepX, (mark[1] - grid.firstY) / grid.stepY].map(Math.round);
     const inside = column >= 0 && row >= 0 && column < grid.columns && row < grid.rows;
-    const value = inside ? grid.values[row * grid.columns + column] : NaN;
+    const node = row * grid.columns + column;
+    const value = inside ? grid.values[node] : NaN;
     const sign = grid.low === 0 ? "" : value >= 0 ? "+" : "−";
-    const words = Number.isNaN(value) ? "–" : `${sign}${Math.abs(value).toFixed(3)} µm`;
-    reading.textContent = `x ${mark[0].toFixed(2)} mm, y ${mark[1].toFixed(2)} mm: ${words}   (${whole})`;
+    const known = grid.low === 0 ? "" : ` ± ${number(2 * grid.sigma[node], 2)}`;
+    const words = Number.isNaN(value) ? "–" : `${sign}${number(Math.abs(value), 2)}${known} µm`;
+    reading.textContent = `x ${number(mark[0], 2)} mm, y ${number(mark[1], 2)} mm: ${words}`;
   }
 
   canvas.addEventListener("pointermove", (event) => {

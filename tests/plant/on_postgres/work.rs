@@ -154,7 +154,7 @@ fn unsigned_recipe_refused_as_incident() {
     for (harm, named) in [
         ("name = 'panel'", "version 1 of panel"),
         ("version = 7", "version 7 of small"),
-        ("text = replace(text, 'columns = 20', 'columns = 21')", "version 1 of small"),
+        ("text = replace(text, 'columns = 16', 'columns = 17')", "version 1 of small"),
     ] {
         plant.sql(&format!("UPDATE recipe SET {harm}"));
         refused(&[named, "hash", "was changed"]);
