@@ -146,7 +146,7 @@ async fn heed_ctrl_c(orders: OrderSender, actor: Actor) {
         let request = if again {
             Request::Abort { reason: "Ctrl-C, twice".into() }
         } else {
-            Request::Hold { reason: "Ctrl-C".into() }
+            Request::Hold { reason: "Ctrl-C".into(), state_number: None }
         };
         orders.send(request, actor.clone()).await;
     }

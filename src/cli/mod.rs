@@ -133,7 +133,7 @@ fn run() -> ExitCode {
         Command::Run(arguments) => run::run(&arguments),
         Command::Plan(arguments) => plan::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
-        Command::Hold(arguments) => control::order(&arguments, |reason| Request::Hold { reason }),
+        Command::Hold(arguments) => control::order(&arguments, |reason| Request::Hold { reason, state_number: None }),
         Command::Resume(arguments) => resume::run(&arguments),
         Command::Recover(arguments) => recover::run(&arguments),
         Command::Stop(arguments) => control::order(&arguments, |reason| Request::Stop { reason }),

@@ -61,7 +61,8 @@ pub(super) struct Arguments {
     /// Seed of another simulated part and run
     #[arg(long, value_name = "N")]
     pub(super) seed: Option<u64>,
-    /// Also show the cell as a page in the browser at this address, as `regrind serve` does
+    /// Also show the cell as a page in the browser at this address, as `regrind serve` does; on a terminal the page stays
+    /// after the run until Ctrl-C
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = serve::ADDRESS)]
     pub(super) serve: Option<SocketAddr>,
     #[command(flatten)]
@@ -111,17 +112,20 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             Some(spec) => Some(simulated::serve(spec, &mut cell, &recipe).await?),
             None => None,
         };
-        let ending = carry_out(arguments, &recipe, &cell, task, plan, earlier, key).await?;
+        let (ending, page) = carry_out(arguments, &recipe, &cell, task, plan, earlier, key).await?;
         if let Some(served) = &world {
             arguments.plant.write_truth(&served.world, &recipe, &cell)?;
         }
         drop(world);
+        if let Some(page) = page {
+            page.stay(arguments.json).await;
+        }
         outcome(&ending)
     })
 }
 
 /// Locks and connects the machines, creates the run folder and the journal, and executes the run until its end. Returns
-/// how the run has ended. `earlier` is the knowledge from earlier runs, or `None` if the recipe does not use any. `key`
+/// how the run has ended, and the process that shows its page. `earlier` is the knowledge from earlier runs, or `None` if the recipe does not use any. `key`
 /// signs the record; without a key the record is not signed. Returns an error if the disk has too little space, a
 /// machine is not available, or a file cannot be written.
 async fn carry_out(
@@ -132,7 +136,7 @@ async fn carry_out(
     plan: CellPlan,
     earlier: Option<EarlierKnowledge>,
     key: Option<AuditKey>,
-) -> Result<Ending, Failure> {
+) -> Result<(Ending, Option<serve::PageProcess>), Failure> {
     let actor = operator(arguments.operator.as_deref());
     let began = SystemTime::now();
     let job = epoch(began);
@@ -143,8 +147,8 @@ async fn carry_out(
     if free < needed {
         return Err(Failure::NoSpace { path: arguments.runs.clone(), free, needed });
     }
-    let page = arguments.serve.map(|at| serve::PageProcess::start(&arguments.runs, at, arguments.json));
-    let _page = page.transpose()?;
+    let page = arguments.serve.map(|at| serve::PageProcess::start(&arguments.runs, &folder, at, arguments.json));
+    let page = page.transpose()?;
     let _plant = arguments.plant.start_processes(&arguments.runs)?;
     let live = RunContext { recipe, cell, part: &part, folder: &folder, job, actor, json: arguments.json };
     let machines = live.open(job)?;
@@ -167,7 +171,8 @@ async fn carry_out(
         record_first_correction(&task, &mut journal)?;
     }
     let loaded = arguments.loaded || cell.simulated;
-    live.carry_out(machines, PreparedRun { task, plan, journal, loaded, interrupted: None }).await
+    let ending = live.carry_out(machines, PreparedRun { task, plan, journal, loaded, interrupted: None }).await?;
+    Ok((ending, page))
 }
 
 /// Returns the time `now` in whole seconds since 1970, modulo 2^31, and at least 1. A machine compares this number with

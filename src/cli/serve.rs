@@ -1,6 +1,6 @@
 //! `regrind serve`: the live page of the cell and of its runs.
 
-use std::io::{self, Read};
+use std::io::{self, IsTerminal, Read, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -13,16 +13,20 @@ use regrind::formats::run_files::RunFile;
 use regrind::recipe::Recipe;
 use regrind::record::begin_of;
 use regrind::setup;
-use regrind_page::{Entrance, Page, Tls, UsersFile};
+use regrind_page::{Entrance, Page, Tls, UsersFile, Viewers};
 use tokio::net::TcpListener;
 
 use super::Outcome;
 use super::failure::Failure;
+use super::outside::Endings;
 
 /// Default address of the page.
 pub(super) const ADDRESS: &str = "127.0.0.1:7373";
-/// Time for which the page stays after the end of its run, so that every browser receives the result.
-const LINGERS: Duration = Duration::from_secs(3);
+/// Time for which the page stays after the end of its run if no browser shows it, so that a browser that is about to
+/// open it receives the result.
+const STAYS_UNSEEN: Duration = Duration::from_secs(3);
+/// Time for which the page stays after the last browser has left.
+const STAYS_SEEN: Duration = Duration::from_secs(60);
 
 /// Show the cell and its runs as a page in the browser
 #[derive(Args, Debug)]
@@ -50,6 +54,9 @@ pub(super) struct Arguments {
     /// End after the end of standard input, that is, after the end of the program that started this one
     #[arg(long, hide = true)]
     while_stdin: bool,
+    /// Name of the run that the first page shows
+    #[arg(long, value_name = "RUN", hide = true)]
+    first_run: Option<String>,
 }
 
 /// Certificate and users of a page.
@@ -87,7 +94,7 @@ impl PageAccess {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let Arguments { runs, listen, door, while_stdin } = arguments;
+    let Arguments { runs, listen, door, while_stdin, first_run } = arguments;
     super::runtime()?.block_on(async {
         let (listener, entrance) = door.open(*listen).await?;
         let taken = |source| Failure::Page { address: *listen, source };
@@ -98,48 +105,103 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             Box::new(move |run| planned.points(run)),
             Box::new(|what| eprintln!("page: {what}")),
         );
-        let page = page.map_err(taken)?;
+        let page = page.map_err(taken)?.with_first_run(first_run.clone());
+        let viewers = page.viewers();
         super::print(&format!("page     {}\n", page.url()))?;
         tokio::select! {
             () = page.serve(listener) => {}
             ended = tokio::signal::ctrl_c(), if !while_stdin => ended.map_err(Failure::Terminal)?,
-            () = end_of_input(), if *while_stdin => tokio::time::sleep(LINGERS).await,
+            () = end_of_run(&viewers), if *while_stdin => {}
         }
         Ok(Outcome::Accepted)
     })
 }
 
-/// Waits until standard input is closed by all writers.
-async fn end_of_input() {
-    let (ended, end) = tokio::sync::oneshot::channel::<()>();
+/// Waits until the program that started this one has ended its run, and then until no browser shows the page any more.
+/// If that program ended in another way, the page ends soon.
+async fn end_of_run(viewers: &Viewers) {
+    let has_ended_well = end_of_input().await;
+    if !has_ended_well {
+        tokio::time::sleep(STAYS_UNSEEN).await;
+    } else if tokio::time::timeout(STAYS_UNSEEN, viewers.come()).await.is_ok() {
+        viewers.gone(STAYS_SEEN).await;
+    }
+}
+
+/// Waits until standard input is closed by all writers. Returns true if it had any content.
+async fn end_of_input() -> bool {
+    let (ended, end) = tokio::sync::oneshot::channel();
     // Own thread, which ends with the program, because a blocked read of a pipe cannot be cancelled.
     std::thread::spawn(move || {
         let mut some = [0; 64];
-        while io::stdin().read(&mut some).is_ok_and(|read| read > 0) {}
-        drop(ended);
+        let mut has_content = false;
+        while io::stdin().read(&mut some).is_ok_and(|read| read > 0) {
+            has_content = true;
+        }
+        ended.send(has_content)
     });
-    drop(end.await);
+    end.await.unwrap_or(false)
 }
 
-/// Process that shows the page of a run. It ends shortly after the program that holds this value.
+/// Process that shows the page of a run. It ends soon after the program that holds this value, unless it is told to stay.
 pub(super) struct PageProcess {
-    _page: Child,
+    page: Child,
 }
 
 impl PageProcess {
-    /// Starts the web page for the runs in the folder `runs` as a separate process. `listen` is the address of the
-    /// page. With `json`, the process prints nothing to standard output. A separate process can neither slow down nor
+    /// Starts the web page for the runs in the folder `runs` as a separate process. The first page shows the run in
+    /// `folder`. `listen` is the address of the page. With `json`, the process prints nothing to standard output. A separate process can neither slow down nor
     /// stop the run in this process. Returns an error if the process cannot be started.
-    pub(super) fn start(runs: &Path, listen: SocketAddr, json: bool) -> Result<Self, Failure> {
+    pub(super) fn start(runs: &Path, folder: &Path, listen: SocketAddr, json: bool) -> Result<Self, Failure> {
         let told = if json { Stdio::null() } else { Stdio::inherit() };
         let failed = |source| Failure::Page { address: listen, source };
         let program = std::env::current_exe().map_err(failed)?;
         let mut command = Command::new(program);
         command.args(["serve", "--while-stdin", "--listen", &listen.to_string(), "--runs"]).arg(runs);
+        if let Some(name) = folder.file_name() {
+            command.arg("--first-run").arg(name);
+        }
         // Ctrl-C is for the run only. If it also ended the page, the browsers would not receive the result.
         super::outside::set_apart(&mut command);
         let page = command.stdin(Stdio::piped()).stdout(told).spawn().map_err(failed)?;
-        Ok(Self { _page: page })
+        Ok(Self { page })
+    }
+
+    /// Keeps the page after the end of the run: on a terminal until Ctrl-C, elsewhere for as long as a browser shows it
+    /// and for some time after. Ctrl-C, SIGTERM and a closed terminal end it in any case. The page has no effect on the
+    /// result of the run, so its errors are ignored.
+    pub(super) async fn stay(mut self, json: bool) {
+        let Ok(mut endings) = Endings::new() else { return };
+        let is_attended = io::stdin().is_terminal() && io::stdout().is_terminal() && !json;
+        let page = &mut self.page;
+        let shown = async {
+            if !json {
+                let until = if is_attended { "until Ctrl-C" } else { "until 60 s after the last browser has left" };
+                let _ = super::print(&format!("page     stays {until}\n"));
+            }
+            if !is_attended && let Some(mut input) = page.stdin.take() {
+                let _ = input.write_all(b"stay\n");
+            }
+            ended(page).await;
+        };
+        tokio::select! {
+            // The handler of Ctrl-C is in place before the message.
+            biased;
+            _ = tokio::signal::ctrl_c() => {}
+            _ = endings.next() => {}
+            () = shown => {}
+        }
+        // It may have ended by itself.
+        let _ = self.page.kill();
+        let _ = self.page.wait();
+    }
+}
+
+/// Waits until a process has ended.
+async fn ended(process: &mut Child) {
+    let mut polls = tokio::time::interval(Duration::from_millis(100));
+    while process.try_wait().is_ok_and(|status| status.is_none()) {
+        polls.tick().await;
     }
 }
 

@@ -152,7 +152,7 @@ impl View {
     async fn hold(&mut self) {
         let folder = self.folder.clone();
         let asked = tokio::task::spawn_blocking(move || {
-            send_request(&folder, &Request::Hold { reason: "regrind watch".into() })
+            send_request(&folder, &Request::Hold { reason: "regrind watch".into(), state_number: None })
         });
         self.said = match asked.await {
             Ok(Ok(reply)) => format!("hold: {}", reply.message),

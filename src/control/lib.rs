@@ -16,7 +16,7 @@ mod socket;
 
 pub use regrind_cell::CycleRow;
 
-pub use request::{OnBehalf, Reply, Request};
+pub use request::{OnBehalf, PreliminaryTouches, Reply, Request};
 pub use snapshot::{JobProgress, NextStep, PartVerdict, PreviewStatistics, Snapshot};
 pub use socket::{
     Control, EndpointChange, ReceivedOrder, StatusStream, is_live, is_live_at, send_request, send_request_at,

@@ -17,6 +17,10 @@ pub enum Request {
     Hold {
         #[serde(default)]
         reason: String,
+        /// Number of the state that the person saw, [`Snapshot::state_number`], if the order only states the reason of
+        /// a hold. Such an order is refused in another state. An order without this number is never refused for it.
+        #[serde(rename = "seen", default, skip_serializing_if = "Option::is_none")]
+        state_number: Option<u64>,
     },
     /// Order to continue.
     Resume {
@@ -68,6 +72,12 @@ pub enum Request {
     /// Remark for the record from a program that gives orders for people, such as the server of the web page: who took
     /// control, or what was refused.
     Remark { what: String },
+    /// Request for the preliminary touches of the present measurement, from the point with the index `from` on. The
+    /// index counts the points of the part in the order of the measurement.
+    Touches {
+        #[serde(default)]
+        from: u32,
+    },
     /// Request for the state of the cell once.
     Status,
     /// Request for the state of the cell now and after every change, until either end closes the connection.
@@ -85,6 +95,42 @@ pub struct Reply {
     pub message: String,
     /// State of the cell after the request.
     pub status: Snapshot,
+    /// Answer to [`Request::Touches`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub touches: Option<PreliminaryTouches>,
+}
+
+impl Reply {
+    /// Returns a reply without touches.
+    pub fn new(accepted: bool, message: String, status: Snapshot) -> Self {
+        Self { accepted, message, status, touches: None }
+    }
+}
+
+/// Touches of the part in a measurement that still runs, in the order of the measurement. They are for display only: no gate
+/// has checked them, and they are not registered.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct PreliminaryTouches {
+    /// Cycle of the measurement.
+    pub cycle: u32,
+    /// Batch of the measurement: 0, or a higher number if touches were chosen or repeated.
+    pub batch: u32,
+    /// Index of the first point among the points of the part, from 0.
+    pub first_index: u32,
+    /// Place of each point, as it was planned: x and y in millimetres, model frame.
+    pub places_mm: Vec<[f64; 2]>,
+    /// Deviation of each point from its planned position, in micrometres; `None` if the probe found nothing.
+    pub deviations_um: Vec<Option<f64>>,
+}
+
+impl PreliminaryTouches {
+    /// Maximum number of points in one answer.
+    pub const MAX_POINTS: usize = 4096;
+
+    /// Returns the number of points that the probe found.
+    pub fn found_count(&self) -> usize {
+        self.deviations_um.iter().flatten().count()
+    }
 }
 
 /// Person for whom a program gives an order.
@@ -111,7 +157,7 @@ impl RequestLine {
     /// Such a text would look different from its content in the record.
     pub(super) fn has_misleading_text(&self) -> bool {
         let text = match &self.request {
-            Request::Hold { reason }
+            Request::Hold { reason, .. }
             | Request::Resume { reason, .. }
             | Request::Stop { reason }
             | Request::Abort { reason } => Some(reason),

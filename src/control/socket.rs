@@ -261,7 +261,7 @@ async fn forward_request(
     status: &watch::Receiver<Snapshot>,
 ) -> Reply {
     if request == Request::Status {
-        return Reply { accepted: true, message: String::new(), status: status.borrow().clone() };
+        return Reply::new(true, String::new(), status.borrow().clone());
     }
     let over = || refusal("the run is over".into(), status);
     let (answer, answered) = oneshot::channel();
@@ -281,7 +281,7 @@ async fn forward_request(
 }
 
 fn refusal(message: String, status: &watch::Receiver<Snapshot>) -> Reply {
-    Reply { accepted: false, message, status: status.borrow().clone() }
+    Reply::new(false, message, status.borrow().clone())
 }
 
 /// Sends the present `status` of the cell to a client through `write`, and sends it again after each change, but at
@@ -292,7 +292,7 @@ fn refusal(message: String, status: &watch::Receiver<Snapshot>) -> Reply {
 async fn stream_status(write: &mut ClientWriter, status: &mut watch::Receiver<Snapshot>) -> io::Result<()> {
     loop {
         let now = status.borrow_and_update().clone();
-        send_reply(write, &Reply { accepted: true, message: String::new(), status: now }).await?;
+        send_reply(write, &Reply::new(true, String::new(), now)).await?;
         tokio::time::sleep(MIN_LINE_INTERVAL).await;
         // A timeout sends the state again, as a change does.
         if let Ok(Err(_)) = tokio::time::timeout(MAX_LINE_INTERVAL, status.changed()).await {
@@ -391,7 +391,7 @@ impl StatusStream {
     /// too many clients already watch.
     pub async fn next(&mut self) -> io::Result<Option<Snapshot>> {
         let Some(text) = tokio::time::timeout(SILENCE_TIMEOUT, self.lines.next_line()).await?? else { return Ok(None) };
-        let Reply { accepted, message, status } = serde_json::from_str(&text)?;
+        let Reply { accepted, message, status, .. } = serde_json::from_str(&text)?;
         if accepted { Ok(Some(status)) } else { Err(io::Error::other(message)) }
     }
 }

@@ -40,11 +40,13 @@ impl Cycles {
         let pose = judged.map_or(task.fixture_cmm_from_model, |found| found.cmm_from_model);
         let seated_anew = last.is_some_and(|cycle| cycle.plan.is_some() && !cycle.is_judged());
         let cycle = self.0.entry(number).or_insert_with(|| CycleState::new((*correction).clone()));
+        cycle.plan_pose = pose;
         let plan = match (&task.adaptive, cycle.repeated_touches.clone(), &cycle.registration) {
             (Some(_), ..) => next_batch_plan(task, cycle, &pose, seated_anew),
             (None, Some(again), Some(found)) => {
                 cycle.batch = cycle.points.as_ref().map_or(0, |points| points.repeat_rounds + 1);
                 let targets = (Vec::new(), again.targets.iter().collect());
+                cycle.plan_pose = found.cmm_from_model;
                 task.plan_targets(cycle.correction.level_mm, &found.cmm_from_model, targets, false)
             }
             _ => task.plan(correction.level_mm, &pose, seated_anew),

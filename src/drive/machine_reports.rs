@@ -54,9 +54,9 @@ impl Drive {
     pub(super) fn update_preview(&mut self, preliminary: &PreliminaryPoints) {
         let number = self.cell.cycle();
         let asked = BatchId { cycle: number, batch: self.cycles.batch(number) };
-        let plan = self.cycles.get(number).and_then(|cycle| cycle.plan.clone());
+        let plan = self.cycles.get(number).and_then(|cycle| Some((cycle.plan.clone()?, cycle.plan_pose)));
         match plan.filter(|_| preliminary.job.job == self.context.job && preliminary.job.batch_id() == asked) {
-            Some(plan) => self.display.preview_statistics.add_points(&plan, preliminary),
+            Some((plan, pose)) => self.display.preview_statistics.add_points(&plan, &pose, preliminary),
             None => self.display.preview_statistics.reset(),
         }
         self.display.status.send_replace(self.snapshot());

@@ -15,19 +15,20 @@ impl Drive {
     /// confirmation about a machine goes to the driver of this machine. Sends the reply through `answer`, if there is
     /// one, after the order is recorded.
     ///
-    /// Refuses a resume if the state of the cell has changed since the person saw it. Does nothing for the requests
+    /// Refuses a resume, and the reason of a hold, if the state of the cell has changed since the person saw it. Does nothing for the requests
     /// `Status` and `Watch`.
     pub(super) async fn handle_order(&mut self, ReceivedOrder { request, actor, answer }: ReceivedOrder) {
-        if let Request::Resume { state_number: Some(seen), .. } = request
+        if let Request::Resume { state_number: Some(seen), .. } | Request::Hold { state_number: Some(seen), .. } =
+            request
             && seen != self.display.state_changes
         {
             let message = format!(
-                "the state of the cell changed before your order arrived; the state is now {}; check this state, then resume",
+                "the state of the cell changed before your order arrived; the state is now {}; check this state, then give the order again",
                 self.cell.in_words()
             );
             // The person who asked may be gone.
             if let Some(answer) = answer {
-                drop(answer.send(Reply { accepted: false, message, status: self.snapshot() }));
+                drop(answer.send(Reply::new(false, message, self.snapshot())));
             }
             return;
         }
@@ -37,12 +38,19 @@ impl Drive {
             }
             Request::Remark { what } => return self.record_remark(&what, &actor, answer),
             Request::Clear { device } => Event::ClearConfirmed { actor, device },
-            Request::Hold { reason } => Event::Hold { actor, reason },
+            Request::Hold { reason, .. } => Event::Hold { actor, reason },
             Request::Resume { reason, .. } => Event::Resume { actor, reason },
             Request::Stop { reason } => Event::Stop { actor, reason },
             Request::Abort { reason } => Event::Abort { actor, reason },
             Request::Loaded => Event::LoadConfirmed { actor },
             Request::Over { device, evidence } => Event::DeclaredOver { actor, device, evidence },
+            Request::Touches { from } => {
+                let touches = Some(self.display.preview_statistics.touches_from(from));
+                if let Some(answer) = answer {
+                    drop(answer.send(Reply { touches, ..Reply::new(true, String::new(), self.snapshot()) }));
+                }
+                return;
+            }
             Request::Status | Request::Watch => return,
         };
         let (refusal, ticket) = self.handle_event(event, None).await;
@@ -89,7 +97,7 @@ impl Drive {
                 Err(reason) => Err(reason),
             };
             let message = told.as_ref().err().unwrap_or(&status.message).clone();
-            let reply = Reply { accepted: told.is_ok(), message, status };
+            let reply = Reply::new(told.is_ok(), message, status);
             if let Some(answer) = answer {
                 let _ = answer.send(reply);
             }

@@ -1,9 +1,10 @@
 //! Preliminary figures of the points that a CMM gives while it still measures, for display only. No gate has checked
 //! them, they are not registered, and nothing is judged or recorded by them.
 
-use regrind_control::PreviewStatistics;
+use regrind_control::{PreliminaryTouches, PreviewStatistics};
 
-use crate::device::{Coordinates, Job, MeasuredPoint, Plan, PreliminaryPoints, TargetKind, TouchStatus};
+use crate::device::{BatchId, Coordinates, Job, MeasuredPoint, Plan, PreliminaryPoints, TargetKind, TouchStatus};
+use crate::geometry::{Point, Pose};
 
 /// Sums over the touches of the part received for a job so far.
 #[derive(Debug, Default)]
@@ -14,13 +15,16 @@ pub(super) struct PreviewAccumulator {
     touch_count: u32,
     square_sum_mm2: f64,
     range_mm: Option<[f64; 2]>,
+    /// Place (x, y in the model frame) and deviation in micrometres of each point of the part, in the order of the plan.
+    touches: Vec<([f64; 2], Option<f64>)>,
 }
 
 impl PreviewAccumulator {
     /// Adds the points `preliminary` of a running measurement to the preview (preliminary figures for display). Points
     /// with the first index 0 begin a new preview. Deletes the preview if the points belong to another job, do not
-    /// follow the last added point, or do not match the targets of `plan`.
-    pub(super) fn add_points(&mut self, plan: &Plan, preliminary: &PreliminaryPoints) {
+    /// follow the last added point, or do not match the targets of `plan`. `cmm_from_model` is the pose of the part that
+    /// the plan assumes.
+    pub(super) fn add_points(&mut self, plan: &Plan, cmm_from_model: &Pose, preliminary: &PreliminaryPoints) {
         let PreliminaryPoints { job, first_index: from, points, coordinates } = preliminary;
         if *from == 0 {
             *self = Self { job: Some(*job), ..Self::default() };
@@ -33,9 +37,14 @@ impl PreviewAccumulator {
         }
         self.received_points += points.len();
         let part = points.iter().zip(due).filter(|(_, target)| target.kind == TargetKind::Part);
-        for (point, target) in part.filter(|(point, _)| point.status == TouchStatus::Touched) {
-            let ball_mm = if *coordinates == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
-            self.add_deviation(deviation_mm(point, &target.point_mm, &target.normal, ball_mm));
+        let ball_mm = if *coordinates == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
+        let model_from_cmm = cmm_from_model.inverse();
+        for (point, target) in part {
+            let found = (point.status == TouchStatus::Touched)
+                .then(|| deviation_mm(point, &target.point_mm, &target.normal, ball_mm));
+            found.into_iter().for_each(|mm| self.add_deviation(mm));
+            let place = model_from_cmm.transform_point(&Point::from(target.point_mm));
+            self.touches.push(([place.x, place.y], found.map(|mm| 1e3 * mm)));
         }
     }
 
@@ -48,6 +57,15 @@ impl PreviewAccumulator {
 
     pub(super) fn reset(&mut self) {
         *self = Self::default();
+    }
+
+    /// Returns the touches of the part from the index `from` on, at most [`PreliminaryTouches::MAX_POINTS`] of them. The
+    /// result is empty if there is no measurement, or if it has not come so far.
+    pub(super) fn touches_from(&self, from: u32) -> PreliminaryTouches {
+        let newer = self.touches.get(from as usize..).unwrap_or_default();
+        let (places_mm, deviations_um) = newer.iter().take(PreliminaryTouches::MAX_POINTS).copied().unzip();
+        let of = self.job.map_or(BatchId { cycle: 0, batch: 0 }, |job| job.batch_id());
+        PreliminaryTouches { cycle: of.cycle, batch: of.batch, first_index: from, places_mm, deviations_um }
     }
 
     /// Returns the number of touches on the part, and the RMS, minimum and maximum of their deviations in µm. Returns
@@ -107,14 +125,20 @@ mod tests {
     fn preview_statistics_along_normals() {
         let mut touching = PreviewAccumulator::default();
         assert_eq!(touching.statistics(), None);
-        touching.add_points(&plan(), &centres(0, &[0.5, 0.003]));
+        touching.add_points(&plan(), &Pose::identity(), &centres(0, &[0.5, 0.003]));
         let mut rest = centres(2, &[-0.004, 9.0]);
         rest.points[1].status = TouchStatus::NotFound;
-        touching.add_points(&plan(), &rest);
+        touching.add_points(&plan(), &Pose::identity(), &rest);
         let told = touching.statistics().unwrap();
         assert_eq!(told.touch_count, 2);
         let near = |found: f64, is: f64| (found - is).abs() < 1e-9;
         assert!(near(told.min_um, -4.0) && near(told.max_um, 3.0) && near(told.rms_um, 12.5_f64.sqrt()), "{told:?}");
+        // The sphere is no point of the part, and the last point was not found.
+        let touches = touching.touches_from(1);
+        assert_eq!((touches.cycle, touches.batch, touches.first_index, touches.deviations_um.len()), (1, 0, 1, 2));
+        assert_eq!(touches.places_mm, [[2.0, 0.0], [3.0, 0.0]]);
+        assert!(near(touches.deviations_um[0].unwrap(), -4.0) && touches.deviations_um[1].is_none(), "{touches:?}");
+        assert_eq!(touching.touches_from(9).deviations_um, []);
     }
 
     #[test]
@@ -127,11 +151,11 @@ mod tests {
             centres(2, &[0.001; 9]),
         ] {
             let mut touching = PreviewAccumulator::default();
-            touching.add_points(&plan(), &centres(0, &[0.5, 0.003]));
-            touching.add_points(&plan(), &wrong);
+            touching.add_points(&plan(), &Pose::identity(), &centres(0, &[0.5, 0.003]));
+            touching.add_points(&plan(), &Pose::identity(), &wrong);
             assert_eq!(touching.statistics(), None, "{wrong:?}");
             // Given from the beginning they count again.
-            touching.add_points(&plan(), &centres(0, &[0.5, 0.003]));
+            touching.add_points(&plan(), &Pose::identity(), &centres(0, &[0.5, 0.003]));
             assert_eq!(touching.statistics().map(|told| told.touch_count), Some(1));
         }
     }

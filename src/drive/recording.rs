@@ -72,7 +72,7 @@ impl Drive {
                     RecordAction::Execute(command) => self.report_not_recorded(*command).await,
                     RecordAction::Answer { answer, message, .. } => {
                         let message = format!("{message}; not recorded: {reason}");
-                        drop(answer.send(Reply { accepted: false, message, status: self.snapshot() }));
+                        drop(answer.send(Reply::new(false, message, self.snapshot())));
                     }
                     RecordAction::Confirm { answer, .. } => drop(answer.send(Err(format!("not recorded: {reason}")))),
                     RecordAction::Nothing => {}
@@ -86,7 +86,7 @@ impl Drive {
             RecordAction::Execute(command) => self.report_start_not_sent(*command).await,
             // The person who asked may be gone.
             RecordAction::Answer { answer, accepted, message } => {
-                drop(answer.send(Reply { accepted, message, status: self.snapshot() }))
+                drop(answer.send(Reply::new(accepted, message, self.snapshot())))
             }
             RecordAction::Confirm { device, confirmation: word, answer } => {
                 self.machines.send(device, StationRequest::Confirm { confirmation: word, answer }).await
@@ -162,7 +162,7 @@ impl Drive {
                         "{message}; only the steps that make the cell safe were carried out, because the order was not recorded: {reason}"
                     );
                     // The person who asked may be gone.
-                    drop(answer.send(Reply { accepted: false, message, status: status.clone() }));
+                    drop(answer.send(Reply::new(false, message, status.clone())));
                 }
                 then => waiting.action = then,
             }

@@ -190,6 +190,8 @@ pub struct ReferenceSphere {
 pub(super) struct CycleState {
     pub(super) correction: Arc<Correction>,
     pub(super) plan: Option<Arc<Plan>>,
+    /// Pose of the part that the plan assumes.
+    pub(super) plan_pose: Pose,
     /// Number of the batch of touches that the plan belongs to, and indices of its targets (`batch_targets`), in an
     /// adaptive measurement.
     pub(super) batch: u32,
@@ -223,6 +225,7 @@ impl CycleState {
         Self {
             correction: Arc::new(correction),
             plan: None,
+            plan_pose: Pose::identity(),
             batch: 0,
             batch_targets: Arc::default(),
             next_targets: None,

@@ -107,8 +107,9 @@ fn drawn(line: &Line, scale: &Scale, language: Language) -> Markup {
 /// the language of the word "cycle".
 fn words(lines: &[Line], language: Language) -> String {
     let of = |line: &Line| {
-        let points =
-            line.points.iter().map(|(cycle, value, _)| format!("{} {cycle}: {value:.2} µm", Text::Cycle.to(language)));
+        let points = line.points.iter().map(|(cycle, value, _)| {
+            format!("{} {cycle}: {} µm", Text::Cycle.to(language), decimal(*value, 2, language))
+        });
         format!("{}: {}", line.name, points.collect::<Vec<_>>().join(", "))
     };
     lines.iter().map(of).collect::<Vec<_>>().join("; ")

@@ -12,6 +12,7 @@
 
 mod alarms;
 mod assets;
+mod attachment;
 mod chart;
 mod gauge;
 mod guard;
@@ -32,6 +33,7 @@ mod texts;
 mod tls;
 mod users;
 mod view;
+mod viewers;
 
 use std::io;
 use std::path::PathBuf;
@@ -49,6 +51,7 @@ pub use subject::PageSubject;
 pub use tls::{Tls, TlsError};
 pub use users::{PageRole, Person, Users, UsersError, UsersFile};
 pub use view::plant_document;
+pub use viewers::Viewers;
 
 use guard::Guard;
 use history::History;
@@ -75,7 +78,18 @@ impl Page {
         let runs = Arc::clone(&history);
         let on_record = Box::new(move |what| drop(orders::write_down(&runs, None, what)));
         let guard = Arc::new(Guard::new(entrance, PageSubject::Cell, log, on_record)?);
-        Ok(Self { guard, run_watcher: live, history, planned })
+        let viewers = Viewers::new();
+        Ok(Self { guard, run_watcher: live, history, planned, viewers, first_run: None })
+    }
+
+    /// Shows the run named `run` first, even if other runs are active.
+    pub fn with_first_run(self, run: Option<String>) -> Self {
+        Self { first_run: run, ..self }
+    }
+
+    /// Returns the browsers that show a run now.
+    pub fn viewers(&self) -> Viewers {
+        self.viewers.clone()
     }
 
     /// Returns the address (URL) that opens the page. It contains the key if there is no list of users.
@@ -104,7 +118,9 @@ fn routes(page: Shared) -> Router {
         .route("/runs/{run}/step-file", get(operator_step::step_file))
         .route("/runs/{run}/report", get(view::report))
         .route("/runs/{run}/planned", get(shape::planned))
+        .route("/runs/{run}/touched", get(shape::touched))
         .route("/runs/{run}/cycles/{cycle}/map", get(shape::map))
         .route("/runs/{run}/cycles/{cycle}/points", get(shape::points))
+        .route("/runs/{run}/cycles/{cycle}/files/{name}", get(shape::saved_file))
         .with_state(page)
 }

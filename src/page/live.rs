@@ -5,10 +5,11 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use regrind_control::{Snapshot, watch};
+use regrind_cell::StateName;
+use regrind_control::{PreliminaryTouches, Request, Snapshot, send_request, watch};
 use regrind_report::{RunResult, RunSummary};
 use tokio::sync::watch::{Receiver, Sender};
-use tokio::task::spawn_blocking;
+use tokio::task::{JoinHandle, spawn_blocking};
 
 use super::history::History;
 
@@ -27,6 +28,8 @@ pub(crate) struct ObservedRun {
     /// True if the program answers.
     pub(crate) answers: bool,
     pub(crate) summary: Arc<RunSummary>,
+    /// Preliminary touches of the measurement that runs; empty if none runs.
+    pub(crate) touches: Arc<PreliminaryTouches>,
 }
 
 impl ObservedRun {
@@ -109,22 +112,78 @@ async fn unwatched(folder: &Path, watched: &WatchedRuns, seen: &Sender<ObservedR
 async fn follow(folder: &Path, history: &Arc<History>, seen: &Sender<ObservedRun>) -> std::io::Result<()> {
     let mut watch = watch(folder).await?;
     let mut read_at = None;
+    let mut reading = None;
     while let Some(snapshot) = watch.next().await? {
-        // Measurements, judgements and alarms always come with a new state.
+        // Measurements, judgements and alarms always come with a new state. The reason of a hold does not.
         let at = (snapshot.state_number, snapshot.cycles.len());
+        let is_held = matches!(snapshot.state, StateName::Holding | StateName::Held);
         let summary = match read_at {
-            Some(before) if before == at => Arc::clone(&seen.borrow().summary),
+            Some(before) if before == at && !is_held => Arc::clone(&seen.borrow().summary),
             _ => read(folder, history).await,
         };
         read_at = Some(at);
+        let known = Arc::clone(&seen.borrow().touches);
+        let touches = newer_touches(folder, known, &snapshot, &mut reading).await;
         let snapshot = Some(Arc::new(snapshot));
         seen.send_if_modified(|now| {
-            let changed = now.snapshot != snapshot || !now.answers;
-            *now = ObservedRun { snapshot, answers: true, summary };
+            let changed = now.snapshot != snapshot || !now.answers || now.summary.hold != summary.hold;
+            *now = ObservedRun { snapshot, answers: true, summary, touches };
             changed
         });
     }
     Ok(())
+}
+
+/// Task that asks the cell for further touches.
+type TouchReader = JoinHandle<Option<PreliminaryTouches>>;
+
+/// Returns the touches of the measurement of `snapshot`: those that are `known`, with the answer of the task `reading`
+/// if it has come. Starts this task again for the next answer. A cell that answers slowly delays nothing. After the
+/// measurement, the touches stay until the next cycle.
+async fn newer_touches(
+    folder: &Path,
+    known: Arc<PreliminaryTouches>,
+    snapshot: &Snapshot,
+    reading: &mut Option<TouchReader>,
+) -> Arc<PreliminaryTouches> {
+    let mut touches = if known.cycle == snapshot.cycle { known } else { Arc::default() };
+    if reading.as_ref().is_some_and(TouchReader::is_finished)
+        && let Some(task) = reading.take()
+        && let Ok(Some(newer)) = task.await
+        && newer.cycle == snapshot.cycle
+    {
+        touches = joined(touches, newer);
+    }
+    let measured = snapshot.preview.map_or(0, |preview| preview.touch_count as usize);
+    let is_due = measured > 0 && (measured != touches.found_count() || snapshot.progress.is_some());
+    if reading.is_none() && is_due {
+        let (folder, from) = (folder.to_owned(), touches.deviations_um.len() as u32);
+        let ask = move || send_request(&folder, &Request::Touches { from }).ok()?.touches;
+        *reading = Some(spawn_blocking(ask));
+    }
+    touches
+}
+
+/// Joins the touches `known` with `newer` ones. Touches of another batch, or that do not follow the known ones, begin
+/// anew.
+fn joined(known: Arc<PreliminaryTouches>, newer: PreliminaryTouches) -> Arc<PreliminaryTouches> {
+    if (known.cycle, known.batch) != (newer.cycle, newer.batch) && newer.first_index != 0 {
+        return Arc::new(PreliminaryTouches {
+            cycle: newer.cycle,
+            batch: newer.batch,
+            ..PreliminaryTouches::default()
+        });
+    }
+    if newer.first_index == 0 {
+        return Arc::new(newer);
+    }
+    if newer.first_index as usize != known.deviations_um.len() || newer.deviations_um.is_empty() {
+        return known;
+    }
+    let mut all = Arc::unwrap_or_clone(known);
+    all.places_mm.extend(newer.places_mm);
+    all.deviations_um.extend(newer.deviations_um);
+    Arc::new(all)
 }
 
 async fn read(folder: &Path, history: &Arc<History>) -> Arc<RunSummary> {
@@ -140,5 +199,34 @@ pub(crate) fn verdict(seen: &ObservedRun) -> Option<bool> {
         RunResult::Accepted => Some(true),
         RunResult::NotAccepted | RunResult::Aborted | RunResult::Stopped => Some(false),
         _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn touches(batch: u32, first_index: u32, um: &[f64]) -> PreliminaryTouches {
+        let places_mm = um.iter().map(|um| [*um, 0.0]).collect();
+        PreliminaryTouches {
+            cycle: 1,
+            batch,
+            first_index,
+            places_mm,
+            deviations_um: um.iter().copied().map(Some).collect(),
+        }
+    }
+
+    #[test]
+    fn touches_join_in_their_order() {
+        let known = joined(Arc::default(), touches(0, 0, &[1.0, 2.0]));
+        let more = joined(known.clone(), touches(0, 2, &[3.0]));
+        assert_eq!(*more, PreliminaryTouches { first_index: 0, ..touches(0, 0, &[1.0, 2.0, 3.0]) });
+        // One that was answered twice, and one that skips a touch.
+        assert_eq!(joined(more.clone(), touches(0, 2, &[3.0])), more);
+        assert_eq!(joined(more.clone(), touches(0, 4, &[5.0])), more);
+        // A new batch begins from its first touch.
+        assert_eq!(joined(more.clone(), touches(1, 3, &[9.0])).deviations_um, []);
+        assert_eq!(joined(more, touches(1, 0, &[9.0])).deviations_um, [Some(9.0)]);
     }
 }

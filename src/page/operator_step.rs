@@ -5,7 +5,6 @@ use std::path::PathBuf;
 
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
-use axum::http::header::{CACHE_CONTROL, CONTENT_DISPOSITION, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 use maud::{Markup, html};
 use regrind_cell::Device;
@@ -13,8 +12,9 @@ use regrind_control::{Request, send_request};
 use regrind_formats::operator_step::{OperatorAction, OperatorStep, RequiredPoints, StepConfirmation};
 use tokio::task::spawn_blocking;
 
+use super::attachment::attachment;
 use super::shared::Shared;
-use super::texts::{Language, Text};
+use super::texts::{Language, Text, shortest};
 
 /// Returns the HTML of the step `step` of the machine `device`. `run` is the address of the run.
 pub(crate) fn card(step: &OperatorStep, device: Device, run: &str, language: Language) -> Markup {
@@ -110,7 +110,7 @@ fn table(action: &OperatorAction, run: &str, language: Language) -> Markup {
                     }
                 }
                 @if let Some(plan) = plan { dt { (say(Text::PlanDigits)) } dd .id { (plan) } }
-                @if let Some(radius) = probe_radius_mm { dt { (say(Text::ProbeRadius)) } dd { (radius) " mm" } }
+                @if let Some(radius) = probe_radius_mm { dt { (say(Text::ProbeRadius)) } dd { (shortest(*radius, language)) " mm" } }
             }
         },
         OperatorAction::BeginPass { part, cycle, program, map, wheel_radius_mm, feed_mm_min, spark_out_passes } => {
@@ -121,8 +121,8 @@ fn table(action: &OperatorAction, run: &str, language: Language) -> Markup {
                     dt { (say(Text::Program)) }
                     dd { @match program { Some(program) => { (file(program)) } None => { (say(Text::OwnProgram)) } } }
                     dt { (say(Text::MapDigits)) } dd .id { (map) }
-                    dt { (say(Text::WheelRadius)) } dd { (wheel_radius_mm) " mm" }
-                    dt { (say(Text::Feed)) } dd { (feed_mm_min) " mm/min" }
+                    dt { (say(Text::WheelRadius)) } dd { (shortest(*wheel_radius_mm, language)) " mm" }
+                    dt { (say(Text::Feed)) } dd { (shortest(*feed_mm_min, language)) " mm/min" }
                     dt { (say(Text::SparkOutPasses)) } dd { (spark_out_passes) }
                 }
             }
@@ -152,16 +152,7 @@ pub(crate) async fn step_file(State(page): State<Shared>, Path(run): Path<String
         Some((name.to_string_lossy().into_owned(), bytes))
     });
     match read.await {
-        Ok(Some((name, bytes))) => {
-            let plain: String = name.chars().filter(|c| c.is_ascii_graphic() && *c != '"').collect();
-            let as_file = format!("attachment; filename=\"{plain}\"");
-            let headers = [
-                (CONTENT_TYPE, "application/octet-stream".to_owned()),
-                (CONTENT_DISPOSITION, as_file),
-                (CACHE_CONTROL, "no-store".to_owned()),
-            ];
-            (headers, bytes).into_response()
-        }
+        Ok(Some((name, bytes))) => attachment(&name, bytes),
         Ok(None) => StatusCode::NOT_FOUND.into_response(),
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }

@@ -84,10 +84,13 @@ pub(super) fn banner(seen: &ObservedRun, language: Language) -> Markup {
             @if *simulation { span .simulation { (say(Text::Simulation)) } }
             div .state {
                 svg .shape viewBox="0 0 24 24" aria-hidden="true" { path d=(shape) {} }
-                div { strong { (word) } @if !more.is_empty() { span .more { (more) } } }
+                div { strong { (word) } @if !more.is_empty() { span .more title=(more) { (more) } } }
             }
-            @if let Some(remaining_s) = remaining_s {
-                div .remaining { strong { (range(remaining_s)) } span { (say(Text::ToEndOfStep)) } }
+            // An empty place keeps the others where they are.
+            div .remaining {
+                @if let Some(remaining_s) = remaining_s {
+                    strong { (range(remaining_s, language)) } " " span { (say(Text::ToEndOfStep)) }
+                } @else { strong { "\u{a0}" } }
             }
         }
     }
@@ -110,7 +113,7 @@ fn state_chip(seen: &ObservedRun, language: Language) -> StateChip {
             0 => String::new(),
             cycle => format!("{} {cycle} {} {}", say(Text::Cycle), say(Text::OfAtMost), live.max_cycles),
         };
-        let parts = [phase, cycle, not_confirmed].into_iter().filter(|part| !part.is_empty());
+        let parts = [not_confirmed, phase, cycle].into_iter().filter(|part| !part.is_empty());
         let (class, shape) = state_symbol(live);
         return StateChip {
             class,
@@ -306,8 +309,20 @@ fn held_by(seen: &ObservedRun, live: &Snapshot, language: Language) -> Markup {
                 (Text::HeldBy.to(language)) " " strong { (hold.by) } ", " (when(&hold.at))
                 @if !hold.reason.is_empty() { ": " (hold.reason) }
             }
+            @if lacks_reason(seen, live) {
+                div .reason {
+                    label { (Text::ReasonOfHold.to(language)) " " input id="hold-reason" type="text" maxlength="300" autocomplete="off"; }
+                    button type="button" data-order="reason" { (Text::StateReason.to(language)) }
+                }
+            }
         }
     }
+}
+
+/// Returns true if a person ordered the hold and has not stated the reason.
+pub(super) fn lacks_reason(seen: &ObservedRun, live: &Snapshot) -> bool {
+    let is_held = matches!(live.state, StateName::Holding | StateName::Held);
+    is_held && seen.summary.hold.as_ref().is_some_and(|hold| hold.reason.is_empty())
 }
 
 /// Returns the HTML of what the machine of the current job waits for.
@@ -318,14 +333,14 @@ fn waits(live: &Snapshot, language: Language) -> Markup {
 /// Formats a range of durations as text, such as `5 – 8 min`. The input is the minimum and the maximum in seconds. The
 /// maximum decides the unit: seconds below 90 s, minutes below 90 min, otherwise hours. If both numbers look the same,
 /// the text contains only one.
-fn range([least, most]: [f64; 2]) -> String {
+fn range([least, most]: [f64; 2], language: Language) -> String {
     let (unit, per) = match most {
         most if most < 90.0 => ("s", 1.0),
         most if most < 5400.0 => ("min", 60.0),
         _ => ("h", 3600.0),
     };
     let digits = usize::from(unit == "h");
-    let [least, most] = [least, most].map(|seconds| format!("{:.digits$}", seconds / per));
+    let [least, most] = [least, most].map(|seconds| decimal(seconds / per, digits, language));
     if least == most { format!("{most} {unit}") } else { format!("{least} – {most} {unit}") }
 }
 

@@ -6,18 +6,24 @@
 //!           the errors of all nodes first, then the standard uncertainties of all
 //!  points   f32 x, y, deviation a point, in the order measured; the deviation is NaN if the fit did not use the point
 //!  planned  f32 x, y a point, in the order in which it is to be touched
+//!  touched  u32 cycle, batch, index of the first point, then f32 x, y, deviation from the planned position a point, in
+//!           the order measured; the deviation is NaN where the probe found nothing
 //! ```
 
 use std::path::PathBuf;
 
-use axum::extract::{Path, State};
+use axum::extract::{Path, Query, State};
 use axum::http::StatusCode;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
+use regrind_control::PreliminaryTouches;
+use regrind_formats::run_files::CycleFile;
 use regrind_formats::{DeviationRow, FormatError, MapNode, read_deviations, read_error_map};
 use regrind_report::CycleSummary;
+use serde::Deserialize;
 use tokio::task::spawn_blocking;
 
+use super::attachment::attachment;
 use super::shared::Shared;
 
 /// Maximum number of nodes of a map that is drawn.
@@ -45,6 +51,67 @@ pub(crate) async fn planned(State(page): State<Shared>, Path(run): Path<String>)
         Some(Ok(Some(points.iter().flatten().flat_map(|value| (*value as f32).to_le_bytes()).collect())))
     })
     .await
+}
+
+/// Files of a cycle that a browser can save: the error map as a table, as pictures and as X3P, and the deviations.
+const SAVED: [CycleFile; 5] = [
+    CycleFile::ErrorMap,
+    CycleFile::ErrorMapPng,
+    CycleFile::ErrorMapSvg,
+    CycleFile::ErrorMapX3p,
+    CycleFile::Deviations,
+];
+
+/// Serves a file of a cycle for saving. Responds with the status 404 if it is none of [`SAVED`], or if the cycle has no
+/// such file.
+pub(crate) async fn saved_file(
+    State(page): State<Shared>,
+    Path((run, cycle, name)): Path<(String, u32, String)>,
+) -> Response {
+    let Some(wanted) = CycleFile::from_name(&name).filter(|wanted| SAVED.contains(wanted)) else {
+        return StatusCode::NOT_FOUND.into_response();
+    };
+    let title = format!("{run}-cycle-{cycle}-{name}");
+    let read = spawn_blocking(move || {
+        // Results that were computed again are in a folder of their own, beside their map.
+        if wanted == CycleFile::Deviations {
+            return std::fs::read(file(&page, &run, cycle, |of| of.deviations.as_ref())?).ok();
+        }
+        let map = file(&page, &run, cycle, |of| of.map.as_ref())?;
+        std::fs::read(map.parent()?.join(wanted.name())).ok()
+    });
+    match read.await {
+        Ok(Some(bytes)) => attachment(&title, bytes),
+        Ok(None) => StatusCode::NOT_FOUND.into_response(),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
+}
+
+/// Query of [`touched`].
+#[derive(Debug, Default, Deserialize)]
+pub(crate) struct TouchedFrom {
+    /// Index of the first point, from 0.
+    #[serde(default)]
+    from: usize,
+}
+
+/// Serves the preliminary deviations of the measurement that runs in the run named `run`, from a point on.
+pub(crate) async fn touched(
+    State(page): State<Shared>,
+    Path(run): Path<String>,
+    Query(TouchedFrom { from }): Query<TouchedFrom>,
+) -> Response {
+    let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
+    let touches = std::sync::Arc::clone(&page.run_watcher.subscribe(&folder).borrow().touches);
+    ([(CONTENT_TYPE, "application/octet-stream"), (CACHE_CONTROL, "no-store")], touch_bytes(&touches, from))
+        .into_response()
+}
+
+fn touch_bytes(touches: &PreliminaryTouches, from: usize) -> Vec<u8> {
+    let head = [touches.cycle, touches.batch, u32::try_from(from).unwrap_or(u32::MAX)];
+    let newer = touches.places_mm.iter().zip(&touches.deviations_um).skip(from);
+    let values = newer.flat_map(|([x, y], um)| [*x as f32, *y as f32, um.map_or(f32::NAN, |um| um as f32)]);
+    head.iter().flat_map(|of| of.to_le_bytes()).chain(values.flat_map(f32::to_le_bytes)).collect()
 }
 
 /// Returns the path of a file that belongs to the cycle `cycle` of the run named `run`. `named` selects which file: it
@@ -136,6 +203,23 @@ fn point_bytes(rows: &[DeviationRow]) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn touch_bytes_begin_at_asked_point() {
+        let touches = PreliminaryTouches {
+            cycle: 2,
+            batch: 1,
+            first_index: 0,
+            places_mm: vec![[0.5, 0.0], [1.5, 0.0], [2.5, -4.0]],
+            deviations_um: vec![Some(1.0), None, Some(-2.5)],
+        };
+        let bytes = touch_bytes(&touches, 1);
+        assert_eq!(bytes[..12], [2, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]);
+        let value = |k: usize| f32::from_le_bytes(bytes[12 + 4 * k..16 + 4 * k].try_into().unwrap());
+        assert!(bytes.len() == 36 && value(0) == 1.5 && value(2).is_nan(), "{bytes:?}");
+        assert_eq!([value(3), value(4), value(5)], [2.5, -4.0, -2.5]);
+        assert_eq!(touch_bytes(&touches, 9).len(), 12);
+    }
 
     #[test]
     fn grid_bytes_of_unordered_nodes() {

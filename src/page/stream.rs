@@ -18,6 +18,7 @@ use super::pieces::{Piece, run_pieces};
 use super::shared::Shared;
 use super::texts::Language;
 use super::view;
+use super::viewers::Viewer;
 
 /// Maximum time between two messages of the stream. A browser that gets no message for longer shows that its figures
 /// are old.
@@ -32,6 +33,7 @@ struct RunEventStream {
     /// Last version of each piece that was sent.
     sent: Vec<(Piece, String)>,
     is_first: bool,
+    _viewer: Viewer,
 }
 
 pub(crate) async fn events(
@@ -43,7 +45,8 @@ pub(crate) async fn events(
     let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
     let seen = page.run_watcher.subscribe(&folder);
     let language = view::language(&headers);
-    let looking = RunEventStream { page, session, language, run: seen, sent: Vec::new(), is_first: true };
+    let _viewer = page.viewers.enter();
+    let looking = RunEventStream { page, session, language, run: seen, sent: Vec::new(), is_first: true, _viewer };
     let stream = unfold(looking, |mut looking| async {
         let event = looking.next().await?;
         Some((Ok::<_, Infallible>(event), looking))

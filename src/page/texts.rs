@@ -46,6 +46,12 @@ pub(crate) fn decimal(value: f64, digits: usize, language: Language) -> String {
     if language == Language::De { text.replacen('.', ",", 1) } else { text }
 }
 
+/// Formats a number with all its decimals, and with the decimal sign of `language`.
+pub(crate) fn shortest(value: f64, language: Language) -> String {
+    let text = value.to_string();
+    if language == Language::De { text.replacen('.', ",", 1) } else { text }
+}
+
 macro_rules! texts {
     ($($name:ident { $en:literal, $de:literal, $zh:literal })+) => {
         /// Text of the page.
@@ -120,6 +126,9 @@ texts! {
     StepsOfCycle { "Steps of the cycle", "Schritte des Zyklus", "循环步骤" }
     ToEndOfStep { "to the end of this step", "bis zum Ende dieses Schritts", "距本步骤结束" }
     HeldBy { "Held by", "Angehalten von", "保持人：" }
+    ReasonOfHold { "Reason of the hold", "Grund des Anhaltens", "保持的原因" }
+    StateReason { "RECORD THE REASON", "GRUND FESTHALTEN", "记录原因" }
+    Answer { "Answer to the last order", "Antwort auf den letzten Befehl", "对上一指令的应答" }
     // Column with the current work.
     NextAction { "Your next action", "Ihr nächster Schritt", "您的下一步" }
     PreliminaryPoints { "preliminary", "vorläufig", "初步" }
@@ -169,7 +178,20 @@ texts! {
     ScaleOfTolerance { "tolerance", "Toleranz", "公差" }
     SignOfMap { "red: too high, blue: too low", "rot: zu hoch, blau: zu tief", "红色偏高，蓝色偏低" }
     NoCycleBefore { "there is no map of the cycle before", "keine Karte des Zyklus davor", "没有上一循环的误差图" }
-    PlanShown { "the plan", "der Plan", "计划" }
+    PreliminaryDots {
+        "preliminary, without height and tilt",
+        "vorläufig, ohne Höhe und Neigung",
+        "初步，已去除高度和倾斜"
+    }
+    HeightFactor { "heights drawn", "Höhen überhöht", "高度放大" }
+    Sections { "Sections along x and y", "Schnitte längs x und y", "沿 x 和 y 的截面" }
+    SectionHelp {
+        "click the map for two sections",
+        "Karte anklicken für zwei Schnitte",
+        "点击误差图显示两个截面"
+    }
+    SaveMap { "Save the map", "Karte speichern", "保存误差图" }
+    Deviations { "Deviations (CSV)", "Abweichungen (CSV)", "偏差（CSV）" }
     Histogram { "Distribution", "Verteilung", "分布" }
     NoRelief {
         "This browser cannot draw the relief (3D view). The page shows the error map instead.",

@@ -21,10 +21,10 @@ use super::chart::chart;
 use super::guard::{Denied, Session, text};
 use super::history::Listed;
 use super::live::{ObservedRun, verdict};
-use super::pieces::{Piece, about, banner, figures, in_path, is_over, run_pieces, verdict_reason, when};
+use super::pieces::{Piece, about, banner, figures, in_path, is_over, lacks_reason, run_pieces, verdict_reason, when};
 use super::shared::Shared;
 use super::subject::PageSubject;
-use super::texts::{self, Language, Text};
+use super::texts::{self, Language, Text, decimal};
 use super::users::Person;
 
 /// Returns the state of a run as JSON for the scripts of the page. `seen` is the current status of the run. `session`
@@ -52,10 +52,15 @@ pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) ->
         "machinesWithin": seen.summary.machines_within,
         "over": seen.summary.ended.is_some() && !seen.answers,
         "number": live.map(|live| live.state_number),
-        "can": live.map_or_else(Vec::new, |live| can(live, session, has_control)),
+        "can": live.map_or_else(Vec::new, |live| {
+            let mut can = can(live, session, has_control);
+            can.extend(Some("reason").filter(|_| lacks_reason(seen, live) && session.may("hold")));
+            can
+        }),
         "cycle": live.map(|live| live.cycle),
         "cycles": cycles,
         "toleranceUm": tolerance.map(|tolerance| 1e3 * tolerance.pv_mm).filter(|um| um.is_finite()),
+        "deviations": [seen.touches.cycle as usize, seen.touches.batch as usize, seen.touches.deviations_um.len()],
         "touched": measures.map(|progress| [progress.done, progress.total]),
         "alarms": live.map_or(0, |live| live.alarms.len()),
         "verdict": verdict(seen),
@@ -96,9 +101,13 @@ fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static st
     can
 }
 
-/// Serves the page of the active run, or of the last run if none is active.
+/// Serves the page of the run that the page was started for, or of the active run, or of the last run if none is
+/// active.
 pub(crate) async fn home(State(page): State<Shared>) -> Response {
     let history = std::sync::Arc::clone(&page.history);
+    if let Some(first) = page.first_run.as_ref().filter(|run| page.history.folder(run).is_some()) {
+        return Redirect::to(&format!("/runs/{}", in_path(first))).into_response();
+    }
     let listed = spawn_blocking(move || history.list()).await.unwrap_or_default();
     let live = listed.iter().filter(|run| run.is_live).count();
     match listed.first().filter(|_| live <= 1) {
@@ -113,6 +122,7 @@ pub(crate) async fn run(
     Path(id): Path<String>,
     headers: HeaderMap,
 ) -> Response {
+    drop(page.viewers.enter());
     let language = language(&headers);
     let Some(folder) = page.history.folder(&id) else { return not_here(PageSubject::Cell, &headers) };
     let mut looked = page.run_watcher.subscribe(&folder);
@@ -143,7 +153,8 @@ fn cell(seen: &ObservedRun, id: &str, session: &Session, has_control: bool, lang
     html! {
         a .skip href="#orders" { (say(Text::SkipToOrders)) }
         div #old role="alert" hidden {}
-        header #banner aria-live="polite" { (piece(Piece::Banner)) }
+        header #banner { (piece(Piece::Banner)) }
+        p #state-said .unseen role="status" {}
         main .cell data-run=(id) {
             section .flow {
                 div #steps aria-label=(say(Text::StepsOfCycle)) role="group" { (piece(Piece::Steps)) }
@@ -166,7 +177,7 @@ fn cell(seen: &ObservedRun, id: &str, session: &Session, has_control: bool, lang
             button .hold type="button" data-order="hold" disabled { (say(Text::Hold)) }
             button .resume type="button" data-order="resume" disabled { (say(Text::Resume)) }
             button .stop type="button" data-order="stop" disabled { (say(Text::Stop)) }
-            div .said {
+            div .said tabindex="0" role="group" aria-label=(say(Text::Answer)) {
                 p #control { (piece(Piece::Control)) }
                 p #answer role="status" { (say(Text::NoButtonStops)) }
             }
@@ -202,9 +213,22 @@ fn map(language: Language) -> Markup {
             label { (say(Text::Cycle)) " " select #cycle {} }
         }
         canvas #map tabindex="0" role="img" aria-label=(say(Text::MapHelp)) {}
-        canvas #relief tabindex="0" role="img" aria-label=(say(Text::MapHelp)) hidden {}
+        div .solid {
+            canvas #relief tabindex="0" role="img" aria-label=(say(Text::MapHelp)) hidden {}
+            canvas #frame aria-hidden="true" hidden {}
+        }
         div .foot { output #caption {} output #reading {} }
-        canvas #histogram role="img" aria-label=(say(Text::Histogram)) {}
+        div .under {
+            canvas #histogram role="img" aria-label=(say(Text::Histogram)) {}
+            canvas #sections role="img" aria-label=(say(Text::Sections)) hidden {}
+        }
+        p #saved .saved hidden {
+            (say(Text::SaveMap)) ": "
+            @for (file, name) in [("error_map.png", "PNG"), ("error_map.svg", "SVG"), ("error_map.csv", "CSV"), ("error_map.x3p", "X3P")] {
+                a data-file=(file) download { (name) } " "
+            }
+            a data-file="deviations.csv" download { (say(Text::Deviations)) }
+        }
     }
 }
 
@@ -215,7 +239,7 @@ fn script_texts(language: Language) -> Value {
         "noData": say(Text::NotConnected), "pageGone": say(Text::PageGone), "programGone": say(Text::ProgramGone), "simulationGone": say(Text::SimulationGone),
         "noRelief": say(Text::NoRelief), "notMeasured": say(Text::NotMeasured), "planned": say(Text::Planned),
         "touched": say(Text::Touched), "filtered": say(Text::Filtered), "known": say(Text::KnownTo), "order": say(Text::NoButtonStops),
-        "sign": say(Text::SignOfMap), "noCycleBefore": say(Text::NoCycleBefore), "plan": say(Text::PlanShown), "points": say(Text::Points),
+        "sign": say(Text::SignOfMap), "noCycleBefore": say(Text::NoCycleBefore), "preliminary": say(Text::PreliminaryDots), "sectionHelp": say(Text::SectionHelp), "heights": say(Text::HeightFactor),
     })
 }
 
@@ -260,6 +284,7 @@ pub(crate) async fn runs(
     Query(wanted): Query<RunFilter>,
     headers: HeaderMap,
 ) -> Response {
+    drop(page.viewers.enter());
     let language = language(&headers);
     let say = |text: Text| text.to(language);
     let history = std::sync::Arc::clone(&page.history);
@@ -315,7 +340,7 @@ fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> M
                     td { (summary.recipe) } td { (when(&summary.began)) }
                     td .n { (summary.cycles.len()) }
                     @for k in 0..2 {
-                        td .n { @if let Some(figures) = figures { (format!("{:.2}", figures[k][0])) } @else { "–" } }
+                        td .n { @if let Some(figures) = figures { (decimal(figures[k][0], 2, language)) } @else { "–" } }
                     }
                     td .n { (summary.alarms.len()) }
                     td class=(if summary.result == RunResult::Accepted { "good" } else { "" }) {
@@ -336,6 +361,7 @@ pub(crate) async fn compare(
     axum::extract::RawQuery(query): axum::extract::RawQuery,
     headers: HeaderMap,
 ) -> Response {
+    drop(page.viewers.enter());
     let language = language(&headers);
     let say = |text: Text| text.to(language);
     let query = query.unwrap_or_default();
@@ -383,6 +409,7 @@ pub(crate) async fn compare(
 /// creates the report from the record. Responds with the status 404 if the run does not exist, and 422 if the report
 /// cannot be created.
 pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, headers: HeaderMap) -> Response {
+    drop(page.viewers.enter());
     let Some(folder) = page.history.folder(&id) else { return not_here(PageSubject::Cell, &headers) };
     let read = spawn_blocking(move || {
         std::fs::read(folder.join(RunFile::Report.name()))

@@ -34,6 +34,8 @@ pub(super) struct RunHistory {
     pub(super) radius_error_mm: Option<(u32, f64)>,
     pub(super) alarms: Vec<AlarmHistory>,
     pub(super) orders: Vec<Order>,
+    /// Number of orders before the last time that a machine was released at its own panel, which ends a hold.
+    orders_before_hold: usize,
     /// Pass that was started last.
     pub(super) pass: Option<PassHistory>,
     /// Time of the last record.
@@ -181,12 +183,22 @@ impl RunHistory {
         }
     }
 
-    /// Returns the last accepted order to hold the cell, if no accepted order to resume it followed.
+    /// Returns the accepted order that holds the cell, if the cell was not resumed since. A further order to hold the
+    /// same cell only states the reason; a person who states it for another is named.
     pub(super) fn hold_order(&self) -> Option<HoldOrder> {
-        let accepted = self.orders.iter().filter(|order| order.refused.is_none());
-        let last = accepted.rev().find(|of| matches!(of.event, Some(Event::Hold { .. } | Event::Resume { .. })))?;
-        let Some(Event::Hold { actor, reason }) = &last.event else { return None };
-        Some(HoldOrder { by: actor.name.clone(), at: last.record.utc.clone(), reason: reason.clone() })
+        let since = self.orders.get(self.orders_before_hold..).unwrap_or_default();
+        let accepted = since.iter().filter(|order| order.refused.is_none());
+        accepted.fold(None, |held: Option<HoldOrder>, order| match (&order.event, held) {
+            (Some(Event::Resume { .. }), _) => None,
+            (Some(Event::Hold { actor, reason }), None) => {
+                Some(HoldOrder { by: actor.name.clone(), at: order.record.utc.clone(), reason: reason.clone() })
+            }
+            (Some(Event::Hold { actor, reason }), Some(held)) if !reason.is_empty() => {
+                let by = if actor.name == held.by { String::new() } else { format!(" ({})", actor.name) };
+                Some(HoldOrder { reason: format!("{reason}{by}"), ..held })
+            }
+            (_, held) => held,
+        })
     }
 
     fn add_command(&mut self, record: Record, command: Command) {
@@ -261,6 +273,7 @@ impl RunHistory {
             Event::RegistrationFailed { cycle, reason } => {
                 self.measurement(cycle).unusable = Some(format!("not registered: {reason}"));
             }
+            Event::MachineResumed { .. } => self.orders_before_hold = self.orders.len(),
             event if event.actor().is_some() => {
                 self.orders.push(Order { record, event: Some(event), refused: None });
             }

@@ -50,7 +50,7 @@ pub struct RunSummary {
     pub probe_off_um: Option<f64>,
     /// Cycle of the pass that was started last; `None` before the first pass.
     pub pass_cycle: Option<u32>,
-    /// Last order of a person to hold the cell; `None` if there is none, or if the cell was resumed since.
+    /// Order of a person that holds the cell; `None` if there is none, or if the cell was resumed since.
     pub hold: Option<HoldOrder>,
 }
 

@@ -1,6 +1,7 @@
 //! The page in a browser, as a person sees it.
 
 use regrind_testcell::browser::{Browser, Tab};
+use regrind_testutils::sample::all;
 use serde_json::json;
 
 use crate::program::{Running, changed, only_run, regrind, root, small_recipe};
@@ -51,6 +52,76 @@ fn orders_show_in_every_tab() {
         assert_eq!(tab.problems(&browser), Vec::<String>::new());
     }
     assert_eq!(shown.run.end().0, 3);
+}
+
+/// Expression for the places of the header, of the steps and of each order, and for everything that is wrong with the
+/// layout: a page wider than the screen, elements that overlap, and targets that are too small for a finger.
+const LAYOUT: &str = "(() => { \
+    const box = (of) => { const b = of.getBoundingClientRect(); return [b.left, b.top + scrollY, b.right, b.bottom + scrollY].map(Math.round); }; \
+    const all = (of) => [...document.querySelectorAll(of)].filter((e) => e.getClientRects().length); \
+    const wrong = []; \
+    if (document.documentElement.scrollWidth > innerWidth) wrong.push('wider than the screen'); \
+    for (const group of ['.banner > *', '.steps > li', '.orders > *', 'main > *:not(.column), .column > *', 'nav > *']) { \
+        const boxes = all(group).filter((e) => getComputedStyle(e).display !== 'contents').map(box); \
+        boxes.forEach((a, k) => boxes.slice(k + 1).forEach((b) => { \
+            if (a[0] < b[2] - 1 && b[0] < a[2] - 1 && a[1] < b[3] - 1 && b[1] < a[3] - 1) wrong.push(`${group}: ${a} and ${b}`); })); \
+    } \
+    for (const e of all('button, select, nav a')) { \
+        const b = e.getBoundingClientRect(); \
+        if (innerWidth < 500 && b.height < 43.5) wrong.push(`${e.outerHTML.slice(0, 60)} is ${b.height} px high`); \
+    } \
+    const fixed = all('.orders > button').map((e) => { const b = e.getBoundingClientRect(); return [b.left, b.top].map(Math.round); }); \
+    return { places: [box(document.querySelector('#banner')), box(document.querySelector('.banner .state')), box(document.querySelector('.steps')), fixed], wrong }; })()";
+
+#[test]
+#[ignore = "needs a browser: Debian package chromium"]
+fn page_keeps_places_in_every_state() {
+    let sizes: &[[u32; 2]] =
+        if all() { &[[1920, 1080], [1366, 768], [1024, 768], [390, 844]] } else { &[[1366, 768], [390, 844]] };
+    let languages: &[&str] = if all() { &["en", "de", "zh"] } else { &["en"] };
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = CellPage::begin(home.path(), 200.0);
+    let held = crate::program::run(&["hold", &shown.folder.display().to_string()], home.path());
+    assert_eq!(held.0, 0, "{held:?}");
+    let mut browser = Browser::start(home.path());
+    let mut tabs = Vec::new();
+    for language in languages {
+        for size in sizes {
+            let tab = browser.open(&shown.url, *size);
+            tab.until(&mut browser, "document.querySelector('.banner.held')");
+            tab.read(
+                &mut browser,
+                &format!("window.isOld = true; document.cookie = 'regrind_language={language}; Path=/'"),
+            );
+            tab.send(&mut browser, "Page.reload", json!({}));
+            tab.until(
+                &mut browser,
+                &format!(
+                    "!window.isOld && document.documentElement.lang === '{language}' && document.querySelector('.banner.held')"
+                ),
+            );
+            tabs.push((tab, *size, *language));
+        }
+    }
+    // Each tab looks when a state appears, however late the test asks.
+    for (tab, ..) in &tabs {
+        let watching = format!(
+            "window.kept = {{ held: {LAYOUT} }}; new MutationObserver(() => {{ for (const state of ['runs', 'good']) \
+             if (!kept[state] && document.querySelector(`.banner.${{state}}`)) kept[state] = {LAYOUT}; }})\
+             .observe(document.body, {{ childList: true, subtree: true }})"
+        );
+        tab.read(&mut browser, &watching);
+    }
+    tabs[0].0.click(&mut browser, "[data-order=resume]");
+    for (tab, size, language) in &tabs {
+        tab.until(&mut browser, "kept.good");
+        let kept = tab.read(&mut browser, "kept");
+        for state in ["held", "runs", "good"] {
+            assert_eq!(kept[state]["wrong"], json!([]), "{state}, {size:?}, {language}");
+            assert_eq!(kept[state]["places"], kept["held"]["places"], "{state}, {size:?}, {language}");
+        }
+    }
+    assert_eq!(shown.run.end().0, 0);
 }
 
 #[test]
@@ -256,7 +327,7 @@ fn pictures_are_made() {
         .unwrap();
     let mut shown = CellPage::start(home.path(), &recipe);
     let mut browser = Browser::start(home.path());
-    let tab = browser.open(&shown.url, [1180, 780]);
+    let tab = browser.open(&shown.url, [1366, 768]);
     tab.until(&mut browser, "document.querySelectorAll('#cycle option').length > 0");
     tab.until(&mut browser, "document.querySelector('.steps .now progress')?.value > 300");
     let picture = |tab: &Tab, browser: &mut Browser, name: &str| {

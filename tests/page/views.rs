@@ -1,8 +1,10 @@
 //! Content of the pages, without a browser.
 
+use std::io::{Read, Write};
+
 use regrind_testcell::http::Visitor;
 
-use crate::program::{SMALL_RECIPE_POINTS, replaced, run, run_folders, small_recipe};
+use crate::program::{Running, SMALL_RECIPE_POINTS, regrind, replaced, run, run_folders, small_recipe};
 use crate::{CellPage, serve};
 
 #[test]
@@ -62,6 +64,18 @@ fn finished_run_pages() {
     assert_eq!(points.body.len(), SMALL_RECIPE_POINTS * 12);
     assert_eq!(visitor.get(&format!("/runs/{}/planned", ids[0])).body.len(), SMALL_RECIPE_POINTS * 8);
     assert_eq!(visitor.get(&format!("/runs/{}/cycles/9/map", ids[0])).status, 404);
+    for file in ["error_map.png", "error_map.svg", "error_map.csv", "error_map.x3p", "deviations.csv"] {
+        let saved = visitor.get(&format!("/runs/{}/cycles/1/files/{file}", ids[0]));
+        assert_eq!(
+            saved.body,
+            std::fs::read(home.path().join("runs").join(ids[0]).join("cycle-1").join(file)).unwrap()
+        );
+        let name = format!("attachment; filename=\"{}-cycle-1-{file}\"", ids[0]);
+        assert_eq!(saved.header("content-disposition"), [name.as_str()]);
+    }
+    for other in ["journal.sqlite", "..%2Frecipe.toml", "toolpath_z.csv", "none.csv"] {
+        assert_eq!(visitor.get(&format!("/runs/{}/cycles/1/files/{other}", ids[0])).status, 404, "{other}");
+    }
 }
 
 /// A page that is loaded again and again asks the cell for one connection, not for more than the cell allows.
@@ -147,4 +161,35 @@ fn stopped_run_shows_last_alarms() {
         alarms.contains("radius of the probe") && alarms.contains("raised") && !alarms.contains("No alarm"),
         "{alarms}"
     );
+}
+
+/// Starts a run beside another active run, and opens its page in a browser. The page shows this run, and it is still
+/// there after the run has ended. Ctrl-C then ends the program with the exit code of the run.
+#[test]
+fn page_of_run_stays_for_viewers() {
+    let home = tempfile::tempdir().unwrap();
+    let slow = small_recipe(home.path(), 20.0).display().to_string();
+    let mut other = Running::new(regrind(&["run", &slow, "--cell", "sim", "--part", "SN-1"], home.path()));
+    other.line("grinding", |line| line.contains("grinding"));
+    let fast = small_recipe(home.path(), 2000.0).display().to_string();
+    let begin = ["run", &fast, "--cell", "sim", "--part", "SN-2", "--serve", "127.0.0.1:0"];
+    let mut run = Running::new(regrind(&begin, home.path()));
+    let line = run.line("address of the page", |line| line.starts_with("page "));
+    run.line("a record", |line| line.contains("grinding"));
+    let visitor = Visitor::with_key(line.trim_start_matches("page").trim());
+    let address = visitor.get("/").header("location")[0].to_owned();
+    // An open page is a stream of events.
+    let mut events = std::net::TcpStream::connect(&visitor.place).unwrap();
+    let request =
+        format!("GET {address}/events HTTP/1.1\r\nHost: {}\r\nCookie: {}\r\n\r\n", visitor.host(), visitor.cookies);
+    events.write_all(request.as_bytes()).unwrap();
+    let mut first = [0; 12];
+    events.read_exact(&mut first).unwrap();
+    assert_eq!(&first, b"HTTP/1.1 200");
+    run.line("the page after the run", |line| line.starts_with("page     stays"));
+    let shown = visitor.get(&address).text();
+    assert!(shown.contains("SN-2") && !shown.contains("SN-1"), "{shown}");
+    assert!(!run.is_over());
+    run.interrupt();
+    assert_eq!(run.end().0, 0);
 }

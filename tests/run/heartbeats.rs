@@ -84,7 +84,7 @@ async fn heartbeats_continue_during_computation() {
     let running = tokio::spawn(drive.run());
     // Registration of the points starts with the acknowledgement of the measurement.
     event(&mut notices, "acknowledged", 2).await;
-    let (reply, ..) = order(&folder, Request::Hold { reason: "while it computes".into() }).await;
+    let (reply, ..) = order(&folder, Request::Hold { reason: "while it computes".into(), state_number: None }).await;
     assert!(reply.message.starts_with("Holding (Register"), "{}", reply.message);
     let (before, mut meanwhile) = (beats(&rig), beats(&rig));
     let computing = async {

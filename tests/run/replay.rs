@@ -20,7 +20,7 @@ async fn finished() -> (Rig, PathBuf) {
     let (drive, orders): (_, OrderSender) = Drive::new(run, cmm, grinder).unwrap();
     let running = tokio::spawn(drive.run());
     event(&mut notices, "registered", 1).await;
-    orders.send(Request::Hold { reason: "tea".into() }, actor.clone()).await;
+    orders.send(Request::Hold { reason: "tea".into(), state_number: None }, actor.clone()).await;
     until(&folder, |words| words.starts_with("Held")).await;
     orders.send(Request::Resume { reason: "tea is over".into(), state_number: None }, actor).await;
     tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();

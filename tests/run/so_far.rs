@@ -50,7 +50,7 @@ async fn status_shows_preliminary_touches() {
     let PreviewStatistics { touch_count, rms_um, min_um, max_um } = told;
     assert!(touch_count <= 90 && rms_um > 0.0 && rms_um <= min_um.abs().max(max_um.abs()), "{told:?}");
     // After a hold, the points stay visible. Orders are obeyed as usual.
-    let (reply, ..) = order(&folder, Request::Hold { reason: "to look".into() }).await;
+    let (reply, ..) = order(&folder, Request::Hold { reason: "to look".into(), state_number: None }).await;
     assert!(reply.accepted, "{reply:?}");
     until(&folder, |words| words.starts_with("Held (Measure, Run)")).await;
     assert!(seen(&folder, |status| status.preview).await.touch_count >= touch_count);

@@ -221,7 +221,7 @@ impl Outside {
         let Some((orders, life)) = self.orders.lock().unwrap().clone() else { return };
         let reason = format!("drawn {}", self.number);
         give(&orders, &life, &self.given, (what, reason), &self.plants, |reason| match what {
-            "hold" => Request::Hold { reason },
+            "hold" => Request::Hold { reason, state_number: None },
             "resume" => Request::Resume { reason, state_number: None },
             "stop" => Request::Stop { reason },
             _ => Request::Abort { reason },

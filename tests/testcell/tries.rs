@@ -101,7 +101,7 @@ pub async fn attempt_with(rig: &Rig, ready: Ready, moment: &Moment, hold: bool) 
 }
 
 async fn hold_and_resume(rig: &Rig, folder: &Path, tried: &mut Tried) {
-    let (reply, began, took) = order(folder, Request::Hold { reason: "a try".into() }).await;
+    let (reply, began, took) = order(folder, Request::Hold { reason: "a try".into(), state_number: None }).await;
     assert!(reply.accepted, "{reply:?}");
     tried.hold_answered = Some(took);
     until(folder, |words| words.starts_with("Held")).await;

@@ -33,6 +33,24 @@ const regrindMap = (() => {
     return [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10].map((k) => k * decade).find((round) => round >= 0.999 * limit) || limit;
   }
 
+  /** Deviations without the plane that fits them best: where the part lies says nothing of its form. */
+  function levelled(places, deviations) {
+    const known = [];
+    for (let k = 0; k < deviations.length; k += 1) if (!Number.isNaN(deviations[k])) known.push(k);
+    if (known.length < 3) return deviations;
+    const mean = (of) => known.reduce((sum, k) => sum + of(k), 0) / known.length;
+    const [x, y] = [(k) => places[2 * k], (k) => places[2 * k + 1]];
+    const [x0, y0, d0] = [mean(x), mean(y), mean((k) => deviations[k])];
+    const [xx, xy, yy] = [mean((k) => (x(k) - x0) ** 2), mean((k) => (x(k) - x0) * (y(k) - y0)), mean((k) => (y(k) - y0) ** 2)];
+    const [xd, yd] = [mean((k) => (x(k) - x0) * deviations[k]), mean((k) => (y(k) - y0) * deviations[k])];
+    const determinant = xx * yy - xy * xy;
+    // The first row of a pattern tells nothing of the other direction.
+    const isFlat = determinant <= 1e-6 * Math.max(xx, yy) ** 2;
+    const alongOne = xx >= yy ? [xx > 0 ? xd / xx : 0, 0] : [0, yd / yy];
+    const [a, b] = isFlat ? alongOne : [(yy * xd - xy * yd) / determinant, (xx * yd - xy * xd) / determinant];
+    return deviations.map((value, k) => value - d0 - a * (x(k) - x0) - b * (y(k) - y0));
+  }
+
   /** The nodes of the lowest and of the highest value. */
   function extremes({ values, columns, firstX, firstY, stepX, stepY }) {
     let [low, high] = [-1, -1];
@@ -138,10 +156,10 @@ const regrindMap = (() => {
   }
 
   /** Draws a map with its axes and its bar; returns how places on the page and on the part belong together. */
-  function draw(canvas, { grid, limit, colours, dots, mark, missing, most, frame }) {
+  function draw(canvas, { grid, limit, colours, dots, mark, missing, most, frame, isPinned, hasBar = Boolean(grid) }) {
     const isEmpty = !grid && !(dots && dots.length);
     const [x0, y0, x1, y1] = isEmpty ? [0, 0, 1.6, 1] : frame || bounds(grid, (dots || []).map((dot) => dot.at));
-    const [left, right, top, bottom] = [46, grid ? 84 : 12, 8, 38];
+    const [left, right, top, bottom] = [46, hasBar ? 84 : 12, 8, 38];
     // The canvas is as high as the part needs at this width, but not higher than the screen allows.
     const wanted = ((canvas.clientWidth - left - right) * (y1 - y0)) / (x1 - x0) + top + bottom;
     if (most) canvas.style.height = `${Math.round(Math.min(Math.max(wanted, 200), most))}px`;
@@ -172,10 +190,20 @@ const regrindMap = (() => {
     [context.strokeStyle, context.lineWidth] = [ink, 1];
     context.strokeRect(offset, top, w, h);
     axes(context, view, { x0, y0, x1, y1, offset, top, w, h, ink });
-    if (grid) bar(context, { limit, low: grid.low, colours, x: offset + w + 14, top, h, ink });
+    if (hasBar) bar(context, { limit, low: grid ? grid.low : -1, colours, x: offset + w + 14, top, h, ink });
     if (grid && grid.low < 0) marks(context, view, extremes(grid), { offset, w, ink, ground });
     if (mark) {
       const [px, py] = view.toPage(...mark);
+      if (isPinned) {
+        const style = getComputedStyle(document.documentElement);
+        [[offset, py, offset + w, py], [px, top, px, top + h]].forEach(([ax, ay, bx, by], k) => {
+          [context.strokeStyle, context.lineWidth] = [style.getPropertyValue(["--pv", "--rms"][k]).trim(), 1.4];
+          context.beginPath();
+          context.moveTo(ax, ay);
+          context.lineTo(bx, by);
+          context.stroke();
+        });
+      }
       for (const [colour, thick] of [[ground, 3], [ink, 1]]) {
         [context.strokeStyle, context.lineWidth] = [colour, thick];
         context.beginPath();
@@ -307,5 +335,53 @@ const regrindMap = (() => {
     context.fillText("µm", left + wide + 8, height - 5);
   }
 
-  return { readGrid, readColours, statistics, roundLimit, difference, frameOf, draw, histogram, level };
+  /** The values of a map along x and along y through a place: [place along the axis, value]. */
+  function sectionsAt(grid, [x, y]) {
+    const along = (count, at) => Array.from({ length: count }, (_, k) => at(k));
+    return [
+      along(grid.columns, (k) => grid.firstX + k * grid.stepX).map((at) => [at, valueAt(grid, at, y)]),
+      along(grid.rows, (k) => grid.firstY + k * grid.stepY).map((at) => [at, valueAt(grid, x, at)]),
+    ];
+  }
+
+  /** Draws the two sections of a map through a place, each in its colour, over one axis of places. */
+  function sections(canvas, grid, place, limit) {
+    const { context, width, height, ink, quiet } = prepared(canvas);
+    const style = getComputedStyle(document.documentElement);
+    const lines = sectionsAt(grid, place);
+    const known = lines.flat().filter(([, value]) => !Number.isNaN(value));
+    if (!known.length) return;
+    const [x0, x1] = [Math.min(...known.map(([at]) => at)), Math.max(...known.map(([at]) => at))];
+    const [left, wide, top, high] = [46, width - 80, 6, height - 28];
+    const low = grid.low < 0 ? -limit : 0;
+    const toX = (at) => left + (wide * (at - x0)) / (x1 - x0 || 1);
+    const toY = (value) => top + (high * (limit - Math.min(Math.max(value, low), limit))) / (limit - low);
+    context.fillStyle = quiet;
+    context.textAlign = "right";
+    for (const [value, text] of ticks(low, limit)) {
+      if (toY(value) > top + 4 && toY(value) < top + high - 2) context.fillText(text, left - 6, toY(value) + 4);
+    }
+    context.textAlign = "center";
+    for (const [at, text] of ticks(x0, x1)) context.fillText(text, toX(at), height - 6);
+    context.textAlign = "left";
+    context.fillText("mm", left + wide + 8, height - 6);
+    context.fillRect(left, toY(0), wide, 1);
+    lines.forEach((line, k) => {
+      context.strokeStyle = style.getPropertyValue(["--pv", "--rms"][k]).trim();
+      context.lineWidth = 1.6;
+      context.beginPath();
+      let isDown = false;
+      for (const [at, value] of line) {
+        if (Number.isNaN(value)) isDown = false;
+        else if (isDown) context.lineTo(toX(at), toY(value));
+        else [isDown] = [true, context.moveTo(toX(at), toY(value))];
+      }
+      context.stroke();
+      context.fillStyle = context.strokeStyle;
+      context.fillText(["x", "y"][k], left + wide + 8, top + 12 + 16 * k);
+    });
+    context.fillStyle = ink;
+  }
+
+  return { sections, readGrid, readColours, statistics, roundLimit, levelled, difference, frameOf, draw, histogram, level };
 })();

@@ -65,23 +65,34 @@
   /** Puts new HTML in, and leaves the focus and what somebody has typed where they were. */
   function replace(holder, html) {
     const focused = holder.contains(document.activeElement) ? document.activeElement.dataset.order || document.activeElement.id : null;
-    const typed = element("evidence") && holder.contains(element("evidence")) ? element("evidence").value : null;
+    const typed = ["evidence", "hold-reason"].map(element).filter((input) => input && holder.contains(input))
+      .map((input) => [input.id, input.value, input.selectionStart, input.selectionEnd]);
     const chosen = element("result-file") && holder.contains(element("result-file")) ? element("result-file") : null;
     holder.innerHTML = html;
     regrindTimes(holder);
     if (chosen && element("result-file")) element("result-file").replaceWith(chosen);
-    if (typed !== null && element("evidence")) element("evidence").value = typed;
     if (focused) (holder.querySelector(`[data-order="${focused}"]`) || element(focused) || holder).focus?.();
+    for (const [id, text, start, end] of typed) {
+      const input = element(id);
+      if (!input) continue;
+      input.value = text;
+      if (document.activeElement === input) input.setSelectionRange(start, end);
+    }
   }
 
+  let saidState = "";
   function shown(before) {
+    // The header has numbers that change every second: only a new state is said.
+    const word = document.querySelector(".banner .state strong").textContent;
+    if (word !== saidState) element("state-said").textContent = saidState = word;
     for (const button of document.querySelectorAll("[data-order]")) {
       const order = button.dataset.order;
       button.disabled = order !== "control" && !state.can.includes(order);
     }
     tellAge();
     const names = (of) => JSON.stringify(of.cycles);
-    if (names(before) !== names(state) || (before.touched || []).join() !== (state.touched || []).join()) chooseCycle();
+    const touches = (of) => JSON.stringify([of.touched, of.deviations]);
+    if (names(before) !== names(state) || touches(before) !== touches(state)) chooseCycle();
   }
 
   /** Says that what is shown is old, as soon as it is, and since when. */
@@ -107,6 +118,7 @@
 
   const bodies = {
     hold: () => ({ order: "hold", reason: "" }),
+    reason: () => ({ order: "hold", reason: element("hold-reason").value.trim(), seen: state.number }),
     resume: () => ({ order: "resume", reason: "", seen: state.number }),
     stop: () => ({ order: "stop", reason: "" }),
     abort: () => ({ order: "abort", reason: "" }),
@@ -118,12 +130,18 @@
     over: (button) => ({ order: "over", device: button.dataset.device, evidence: element("evidence").value.trim() }),
   };
 
+  document.addEventListener("keydown", (event) => {
+    const order = { "hold-reason": "reason", evidence: "over" }[event.target.id];
+    if (event.key === "Enter" && order) document.querySelector(`[data-order="${order}"]`)?.click();
+  });
+
   document.addEventListener("click", async (event) => {
     const button = event.target.closest("[data-order]");
     if (!button || button.disabled) return;
     const order = button.dataset.order;
-    if (order === "over" && !element("evidence").value.trim()) {
-      element("evidence").focus();
+    const needed = element({ over: "evidence", reason: "hold-reason" }[order]);
+    if (needed && !needed.value.trim()) {
+      needed.focus();
       return;
     }
     const file = order === "measurement" ? element("result-file").files[0] : null;
@@ -175,6 +193,7 @@
     update();
   });
   scales.addEventListener("change", update);
+  const isCompared = () => view === "difference" || view === "sigma";
   cycles.addEventListener("change", () => {
     chosen = cycles.value === "" ? null : Number(cycles.value);
     update();
@@ -193,22 +212,27 @@
     update();
   }
 
-  let updating = 0;
+  /** More points than these are drawn at most once a second. */
+  const MANY_POINTS = 20000;
+  let [isUpdating, isAsked] = [false, false];
   async function update() {
-    const turn = (updating += 1);
-    const made = await make();
-    // Somebody may have chosen otherwise while the bytes were on their way.
-    if (turn === updating) {
-      current = made;
+    isAsked = true;
+    if (isUpdating) return;
+    isUpdating = true;
+    while (isAsked) {
+      isAsked = false;
+      current = await make();
       paint();
+      if (current.dots && current.dots.length > MANY_POINTS) await new Promise((resume) => setTimeout(resume, 1000));
     }
+    isUpdating = false;
   }
 
   /** The difference of a cycle has a scale of its own: nothing else is comparable with it. */
   async function limitOf(grid, mapped) {
     const own = regrindMap.roundLimit(regrindMap.statistics(grid.values).limit);
-    if (view === "sigma" || view === "difference" || scales.value === "own") return own;
-    if (scales.value === "tolerance") return state.toleranceUm ? state.toleranceUm / 2 : own;
+    if (isCompared() || scales.value === "own") return own;
+    if (scales.value === "tolerance" && state.toleranceUm) return state.toleranceUm / 2;
     const first = await mapOf(run, mapped[0].cycle, mapped[0].map);
     return first ? regrindMap.roundLimit(regrindMap.statistics(first.values).limit) : own;
   }
@@ -231,7 +255,7 @@
   /** The points of the plan until there is a map, or those of the cycle where somebody wants them. */
   async function dotsOver(grid, limit, of) {
     if (view !== "relief" && view !== "difference" && (state.touched || !grid) && (!grid || withPoints)) {
-      const plan = await dotsOfPlan(Boolean(grid));
+      const plan = await dotsOfPlan(grid ? limit : null);
       if (plan) return plan;
     }
     if (withPoints && of && of.points) {
@@ -250,43 +274,79 @@
     return {};
   }
 
-  /** The points of the plan: full where they were touched. */
-  async function dotsOfPlan(isOverMap) {
+  /** The touches that the machine gave so far, each fetched once: places and deviations. */
+  let live = { of: "", places: [], deviations: [] };
+  async function touches() {
+    const [cycle, batch, count] = state.deviations;
+    const of = `${cycle}/${batch}`;
+    if (live.of !== of || live.deviations.length > count) live = { of, places: [], deviations: [] };
+    if (live.deviations.length < count) {
+      const from = live.deviations.length;
+      const answer = await fetch(`${base}/touched?from=${from}`).catch(() => null);
+      const buffer = answer && answer.ok ? await answer.arrayBuffer() : null;
+      const head = buffer && new DataView(buffer);
+      if (head && `${head.getUint32(0, true)}/${head.getUint32(4, true)}` === of) {
+        const values = new Float32Array(buffer, 12);
+        for (let k = 0; k < values.length; k += 3) {
+          live.places.push(values[k], values[k + 1]);
+          live.deviations.push(values[k + 2]);
+        }
+      }
+    }
+    return live;
+  }
+
+  /** The points of the plan, and over them what was touched, in the colour of its deviation. */
+  async function dotsOfPlan(limitOfMap) {
     planned = planned || await bytes(`${base}/planned`);
     if (!planned) return null;
     const places = new Float32Array(planned);
     const count = places.length / 2;
     const [done, total] = state.touched || [0, count];
-    // Where touches are chosen, a job has fewer points than the plan, in an order of its own. They are drawn once they are known.
-    const isChosen = total < count;
-    if (isChosen && isOverMap) return null;
-    // The reference sphere is touched before the part.
-    const touched = isChosen ? 0 : Math.max(0, done - (total - count));
+    const known = await touches();
+    // A batch of chosen touches is drawn over the map of those before it only once it is known.
+    if (limitOfMap && !known.deviations.length && total < count) return null;
+    const values = regrindMap.levelled(known.places, known.deviations);
+    const dotLimit = limitOfMap || regrindMap.roundLimit(regrindMap.statistics(values).limit);
     const ink = getComputedStyle(document.body).color.match(/\d+/g).slice(0, 3).map(Number);
+    const hues = Array.from({ length: 255 }, (_, k) => (view === "sigma" && limitOfMap ? [255, 255, 255] : Array.from(colours.subarray(3 * k, 3 * k + 3))));
+    // A machine that gives no points before the end touches the reference sphere first, and then the part in the order of the plan.
+    const inOrder = known.deviations.length || total < count ? 0 : Math.max(0, done - (total - count));
     const dots = [];
     for (let k = 0; k < count; k += 1) {
-      const isTouched = k < touched;
+      const isTouched = k < inOrder;
       dots.push({ at: [places[2 * k], places[2 * k + 1]], size: isTouched ? 2.6 : 1.4, rgb: isTouched ? ink : null });
     }
-    const key = isChosen
-      ? `○ ${texts.planned} ${number(count, 0)}   ${texts.touched} ${number(done, 0)} / ${number(total, 0)}`
-      : `● ${texts.touched} ${number(touched, 0)}   ○ ${texts.planned} ${number(count - touched, 0)}`;
-    return { dots, key };
+    values.forEach((value, k) => {
+      if (!Number.isNaN(value)) dots.push({ at: [known.places[2 * k], known.places[2 * k + 1]], size: 2.8, rgb: hues[regrindMap.level(value, dotLimit)] });
+    });
+    const touched = known.deviations.length || inOrder;
+    const words = touched ? [`● ${texts.touched} ${number(touched, 0)}`] : [];
+    words.push(`○ ${texts.planned} ${number(count, 0)}`);
+    if (values.length) words.push(texts.preliminary);
+    return { dots, key: words.join(" · "), dotLimit: values.length && !limitOfMap ? dotLimit : null };
   }
 
   let seen = null;
   function paint() {
     if (!current) return;
-    const { grid, limit, dots, missing } = current;
+    const { grid, limit, dots, missing, dotLimit } = current;
     const hues = grid && grid.low === 0 ? unsigned : colours;
     const asRelief = view === "relief" && grid;
-    if (asRelief && solid === undefined) solid = regrindRelief.prepare(relief);
+    if (asRelief && solid === undefined) solid = regrindRelief.prepare(relief, element("frame"));
     const drawnSolid = asRelief && solid;
-    [canvas.hidden, relief.hidden] = [Boolean(drawnSolid), !drawnSolid];
+    [canvas.hidden, relief.hidden, element("frame").hidden] = [Boolean(drawnSolid), !drawnSolid, !drawnSolid];
     if (drawnSolid) solid.show(grid, limit, colours);
-    else seen = regrindMap.draw(canvas, { grid, limit, colours: hues, dots, mark, missing, most: Math.max(280, innerHeight - 400) });
-    element("histogram").hidden = !grid;
+    else seen = regrindMap.draw(canvas, { grid, limit: dotLimit || limit, colours: hues, dots, mark, missing, isPinned, hasBar: Boolean(grid || dotLimit), most: Math.max(280, innerHeight - 400) });
+    scales.disabled = isCompared();
+    scales.querySelector("[value=tolerance]").disabled = !state.toleranceUm;
+    element("saved").hidden = cycles.value === "";
+    for (const link of document.querySelectorAll("[data-file]")) link.href = `${base}/cycles/${cycles.value}/files/${link.dataset.file}`;
+    // What is shown decides how wide each picture is.
+    const hasSections = Boolean(grid && mark && isPinned && !drawnSolid);
+    [element("histogram").hidden, element("sections").hidden] = [!grid, !hasSections];
     if (grid) regrindMap.histogram(element("histogram"), grid, limit, hues);
+    if (hasSections) regrindMap.sections(element("sections"), grid, mark, limit);
     read(asRelief && !solid ? texts.noRelief : null);
   }
 
@@ -296,8 +356,10 @@
   /** Says what the map is, and what it has at the mark, or in all. */
   function read(instead) {
     const { grid, key } = current;
+    const extent = grid && { wide: grid.columns * grid.stepX, deep: grid.rows * grid.stepY, limit: current.limit };
+    const help = !relief.hidden && grid ? [`${texts.heights} × ${number(regrindRelief.heightFactor(extent), 0)}`] : isPinned ? [] : [texts.sectionHelp];
     caption.textContent = grid
-      ? [`${number(grid.columns * grid.stepX, 0)} × ${number(grid.rows * grid.stepY, 0)} mm`, ...(grid.low < 0 ? [texts.sign] : [])].join(" · ")
+      ? [`${number(grid.columns * grid.stepX, 0)} × ${number(grid.rows * grid.stepY, 0)} mm`, ...(grid.low < 0 ? [texts.sign] : []), ...help].join(" · ")
       : key || "";
     if (instead || !grid) {
       reading.textContent = instead || "";
@@ -316,23 +378,50 @@
     const node = row * grid.columns + column;
     const value = inside ? grid.values[node] : NaN;
     const sign = grid.low === 0 ? "" : value >= 0 ? "+" : "−";
-    const known = grid.low === 0 ? "" : ` ± ${number(2 * grid.sigma[node], 2)}`;
+    // The uncertainty of a difference is not that of one map.
+    const known = isCompared() || !Number.isFinite(grid.sigma[node]) ? "" : ` ± ${number(2 * grid.sigma[node], 2)}`;
     const words = Number.isNaN(value) ? "–" : `${sign}${number(Math.abs(value), 2)}${known} µm`;
     reading.textContent = `x ${number(mark[0], 2)} mm, y ${number(mark[1], 2)} mm: ${words}`;
   }
 
-  canvas.addEventListener("pointermove", (event) => {
-    if (!seen) return;
+  /** Whether the mark stays where somebody put it, with two sections through it. It is dragged, and goes with a double click. */
+  let isPinned = false;
+  let isDragged = false;
+  function moveMark(event) {
+    if (!seen || !current || !current.grid) return;
     const box = canvas.getBoundingClientRect();
     mark = seen.toPart(event.clientX - box.left, event.clientY - box.top);
     paint();
+  }
+  canvas.addEventListener("pointerdown", () => { isDragged = isPinned; });
+  // A finger that scrolls the page gives no click.
+  canvas.addEventListener("click", (event) => {
+    isPinned = Boolean(current && current.grid);
+    moveMark(event);
   });
-  canvas.addEventListener("pointerleave", () => { mark = null; paint(); });
+  for (const end of ["pointerup", "pointercancel"]) addEventListener(end, () => { isDragged = false; });
+  canvas.addEventListener("pointermove", (event) => {
+    if (isDragged || !isPinned) moveMark(event);
+  });
+  canvas.addEventListener("pointerleave", () => {
+    if (isPinned) return;
+    mark = null;
+    paint();
+  });
+  canvas.addEventListener("dblclick", () => {
+    [isPinned, mark] = [false, null];
+    paint();
+  });
   canvas.addEventListener("keydown", (event) => {
     const grid = current && current.grid;
     const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    if (event.key === "Escape") {
+      [isPinned, mark] = [false, null];
+      paint();
+    }
     if (!step || !grid) return;
     event.preventDefault();
+    isPinned = true;
     const middle = [grid.firstX + grid.stepX * (grid.columns >> 1), grid.firstY + grid.stepY * (grid.rows >> 1)];
     mark = (mark || middle).map((place, k) => place + step[k] * (k ? grid.stepY : grid.stepX));
     paint();

@@ -1,6 +1,11 @@
 // The map as a relief that turns. Heights are drawn so that the largest is a fifth of the part's width.
 "use strict";
 const regrindRelief = (() => {
+  /** Height, in halves of the part's longer side, at which the limit of the scale is drawn. */
+  const DRAWN_LIMIT = 0.2;
+  /** How many times larger the view draws heights than lengths. */
+  const RAISED = 1.6;
+
   const VERTEX = `
     attribute vec3 place; attribute vec3 colour; attribute vec3 normal;
     uniform mat4 turn; varying vec3 shade;
@@ -30,7 +35,7 @@ const regrindRelief = (() => {
     const size = Math.max(wide, deep) || 1;
     const value = (column, row) => grid.values[row * stride * grid.columns + column * stride];
     const vertices = new Float32Array(columns * rows * 9);
-    const height = (column, row) => 0.2 * value(column, row) / limit;
+    const height = (column, row) => DRAWN_LIMIT * value(column, row) / limit;
     for (let row = 0; row < rows; row += 1) {
       for (let column = 0; column < columns; column += 1) {
         const [z, at] = [value(column, row), 9 * (row * columns + column)];
@@ -41,7 +46,7 @@ const regrindRelief = (() => {
         const slope = (a, b, step) => (Number.isNaN(a) || Number.isNaN(b) || a === undefined || b === undefined ? 0 : (a - b) / step);
         const dx = slope(height(Math.min(column + 1, columns - 1), row), height(Math.max(column - 1, 0), row), 4 * stride * grid.stepX / size);
         const dy = slope(height(column, Math.min(row + 1, rows - 1)), height(column, Math.max(row - 1, 0)), 4 * stride * grid.stepY / size);
-        vertices.set([x, y, 0.2 * z / limit, colours[k] / 255, colours[k + 1] / 255, colours[k + 2] / 255, -dx, -dy, 1], at);
+        vertices.set([x, y, DRAWN_LIMIT * z / limit, colours[k] / 255, colours[k + 1] / 255, colours[k + 2] / 255, -dx, -dy, 1], at);
       }
     }
     const triangles = [];
@@ -64,16 +69,55 @@ const regrindRelief = (() => {
     return new Float32Array([
       sx * ct, sy * sf * st, 0.4 * cf * st, 0,
       -sx * st, sy * sf * ct, 0.4 * cf * ct, 0,
-      0, sy * 1.6 * cf, -0.4 * sf, 0,
+      0, sy * RAISED * cf, -0.4 * sf, 0,
       0, 0, 0, 1]);
   }
 
+  /** How many times larger heights are drawn than lengths. */
+  const heightFactor = ({ wide, deep, limit }) => (RAISED * DRAWN_LIMIT * Math.max(wide, deep)) / 2 / (limit / 1000);
+
+  /** Draws the rectangle under the part with its sizes, and the scale of the heights at one of its corners. */
+  function drawFrame(canvas, extent, turn) {
+    const { wide, deep, limit } = extent;
+    const size = Math.max(wide, deep) || 1;
+    const fine = window.devicePixelRatio || 1;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    [canvas.width, canvas.height] = [width * fine, height * fine].map(Math.round);
+    const context = canvas.getContext("2d");
+    context.scale(fine, fine);
+    const style = getComputedStyle(document.documentElement);
+    const quiet = style.getPropertyValue("--quiet").trim();
+    [context.strokeStyle, context.fillStyle, context.font] = [quiet, quiet, "13px Arial, sans-serif"];
+    const onPage = ([x, y, z]) => {
+      const at = [0, 1].map((k) => turn[k] * x + turn[4 + k] * y + turn[8 + k] * z);
+      return [(0.5 + at[0] / 2) * width, (0.5 - at[1] / 2) * height];
+    };
+    const line = (...places) => {
+      context.beginPath();
+      places.map(onPage).forEach(([px, py], k) => (k ? context.lineTo(px, py) : context.moveTo(px, py)));
+      context.stroke();
+    };
+    const [x, y, z] = [wide / size, deep / size, DRAWN_LIMIT];
+    line([-x, -y, -z], [x, -y, -z], [x, y, -z], [-x, y, -z], [-x, -y, -z]);
+    const text = (words, place, dx, dy) => {
+      const [px, py] = onPage(place);
+      context.fillText(words, Math.min(Math.max(px + dx, 4), width - 60), Math.min(Math.max(py + dy, 14), height - 4));
+    };
+    const local = (value, digits) => value.toLocaleString(document.documentElement.lang, { maximumFractionDigits: digits });
+    text(`x ${local(wide, 0)} mm`, [0, -y, -z], 0, 18);
+    text(`y ${local(deep, 0)} mm`, [x, 0, -z], 8, 14);
+    // The corner that lies leftmost has room beside it.
+    const corner = [[-x, -y], [x, -y], [x, y], [-x, y]].reduce((a, b) => (onPage([...b, 0])[0] < onPage([...a, 0])[0] ? b : a));
+    line([...corner, -z], [...corner, z]);
+    for (const share of [-1, 0, 1]) text(`${share > 0 ? "+" : share < 0 ? "−" : ""}${local(Math.abs(share) * limit, 2)}${share ? "" : " µm"}`, [...corner, share * z], -44, 4);
+  }
+
   /** Prepares a canvas; nothing where the browser has no WebGL. */
-  function prepare(canvas) {
+  function prepare(canvas, frame) {
     const gl = canvas.getContext("webgl", { preserveDrawingBuffer: true, antialias: true });
     const program = gl && compiled(gl);
     if (!program) return null;
-    const state = { turn: 0.6, tilt: 0.7, count: 0 };
+    const state = { turn: 0.6, tilt: 0.7, count: 0, extent: null };
     const [vertices, triangles] = [gl.createBuffer(), gl.createBuffer()];
     const paint = () => {
       const fine = window.devicePixelRatio || 1;
@@ -92,6 +136,7 @@ const regrindRelief = (() => {
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, triangles);
       gl.uniformMatrix4fv(gl.getUniformLocation(program, "turn"), false, matrix(state.turn, state.tilt, canvas.width / canvas.height));
       gl.drawElements(gl.TRIANGLES, state.count, gl.UNSIGNED_SHORT, 0);
+      if (state.extent) drawFrame(frame, state.extent, matrix(state.turn, state.tilt, canvas.width / canvas.height));
     };
     const turnBy = (turn, tilt) => {
       state.turn += turn;
@@ -122,10 +167,11 @@ const regrindRelief = (() => {
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, triangles);
       gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, made.triangles, gl.STATIC_DRAW);
       state.count = made.triangles.length;
+      state.extent = { wide: grid.columns * grid.stepX, deep: grid.rows * grid.stepY, limit };
       paint();
     };
     return { show, paint };
   }
 
-  return { prepare };
+  return { prepare, heightFactor };
 })();
