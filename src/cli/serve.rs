@@ -143,15 +143,17 @@ async fn end_of_input() -> bool {
     end.await.unwrap_or(false)
 }
 
-/// Process that shows the page of a run. It ends soon after the program that holds this value, unless it is told to stay.
+/// Process that shows the page of a run. It ends soon after the program that holds this value, unless it is told to
+/// stay.
 pub(super) struct PageProcess {
     page: Child,
 }
 
 impl PageProcess {
     /// Starts the web page for the runs in the folder `runs` as a separate process. The first page shows the run in
-    /// `folder`. `listen` is the address of the page. With `json`, the process prints nothing to standard output. A separate process can neither slow down nor
-    /// stop the run in this process. Returns an error if the process cannot be started.
+    /// `folder`. `listen` is the address of the page. With `json`, the process prints nothing to standard output. A
+    /// separate process can neither slow down nor stop the run in this process. Returns an error if the process cannot
+    /// be started.
     pub(super) fn start(runs: &Path, folder: &Path, listen: SocketAddr, json: bool) -> Result<Self, Failure> {
         let told = if json { Stdio::null() } else { Stdio::inherit() };
         let failed = |source| Failure::Page { address: listen, source };

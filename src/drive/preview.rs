@@ -15,7 +15,8 @@ pub(super) struct PreviewAccumulator {
     touch_count: u32,
     square_sum_mm2: f64,
     range_mm: Option<[f64; 2]>,
-    /// Place (x, y in the model frame) and deviation in micrometres of each point of the part, in the order of the plan.
+    /// Place (x, y in the model frame) and deviation in micrometres of each point of the part, in
+    /// the order of the plan.
     touches: Vec<([f64; 2], Option<f64>)>,
 }
 

@@ -146,7 +146,8 @@ async fn newer_touches(
     snapshot: &Snapshot,
     reading: &mut Option<TouchReader>,
 ) -> Arc<PreliminaryTouches> {
-    let mut touches = if known.cycle == snapshot.cycle { known } else { Arc::default() };
+    let measured = snapshot.preview.map_or(0, |preview| preview.touch_count as usize);
+    let mut touches = if is_of_measurement(&known, snapshot.cycle, measured) { known } else { Arc::default() };
     if reading.as_ref().is_some_and(TouchReader::is_finished)
         && let Some(task) = reading.take()
         && let Ok(Some(newer)) = task.await
@@ -154,7 +155,6 @@ async fn newer_touches(
     {
         touches = joined(touches, newer);
     }
-    let measured = snapshot.preview.map_or(0, |preview| preview.touch_count as usize);
     let is_due = measured > 0 && (measured != touches.found_count() || snapshot.progress.is_some());
     if reading.is_none() && is_due {
         let (folder, from) = (folder.to_owned(), touches.deviations_um.len() as u32);
@@ -162,6 +162,13 @@ async fn newer_touches(
         *reading = Some(spawn_blocking(ask));
     }
     touches
+}
+
+/// Returns true if the touches `known` belong to the present measurement of `cycle`, or to its last one while none runs.
+/// `measured` is the number of touches that the cell states; it is 0 while none runs. A measurement that is repeated
+/// begins anew, so the cell then states fewer touches than are known.
+fn is_of_measurement(known: &PreliminaryTouches, cycle: u32, measured: usize) -> bool {
+    known.cycle == cycle && (measured == 0 || measured >= known.found_count())
 }
 
 /// Joins the touches `known` with `newer` ones. Touches of another batch, or that do not follow the known ones, begin
@@ -214,6 +221,16 @@ mod tests {
             first_index,
             places_mm,
             deviations_um: um.iter().copied().map(Some).collect(),
+        }
+    }
+
+    #[test]
+    fn repeated_measurement_begins_anew() {
+        let known = touches(0, 0, &[1.0, 2.0, 3.0]);
+        for (cycle, measured, stays) in
+            [(1, 3, true), (1, 9, true), (1, 0, true), (1, 1, false), (2, 3, false), (2, 0, false)]
+        {
+            assert_eq!(is_of_measurement(&known, cycle, measured), stays, "cycle {cycle}, {measured} touches");
         }
     }
 

@@ -3,6 +3,7 @@
 use std::io::{Read, Write};
 
 use regrind_testcell::http::Visitor;
+use serde_json::{Value, json};
 
 use crate::program::{Running, SMALL_RECIPE_POINTS, regrind, replaced, run, run_folders, small_recipe};
 use crate::{CellPage, serve};
@@ -192,4 +193,33 @@ fn page_of_run_stays_for_viewers() {
     assert!(!run.is_over());
     run.interrupt();
     assert_eq!(run.end().0, 0);
+}
+
+/// A person holds the cell without a reason. The page names this person, and takes the reason for the present state
+/// only. The order that states it moves nothing.
+#[test]
+fn reason_of_hold_is_recorded_on_page() {
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = CellPage::begin(home.path(), 20.0);
+    shown.run.line("grinding", |line| line.contains("grinding"));
+    let visitor = shown.visitor();
+    let page = |visitor: &Visitor| visitor.get(&format!("/runs/{}", shown.id)).text();
+    assert!(!page(&visitor).contains("id=\"hold-reason\""));
+    let held = visitor.order(&shown.id, &json!({ "order": "hold", "reason": "" }));
+    assert!(held.1, "{held:?}");
+    let number = |status: &str| serde_json::from_str::<Value>(status).unwrap()["status"]["number"].as_u64().unwrap();
+    let status = || run(&["status", &shown.folder.display().to_string(), "--json"], home.path()).1;
+    shown.run.until("a held cell", |_| status().contains("\"Held\"").then_some(()));
+    let asks = page(&visitor);
+    assert!(asks.contains("Held by") && asks.contains("id=\"hold-reason\""), "{asks}");
+    let reason =
+        |seen: u64| visitor.order(&shown.id, &json!({ "order": "hold", "reason": "burnt smell", "seen": seen }));
+    let now = number(&status());
+    let (_, accepted, message) = reason(now - 1);
+    assert!(!accepted && message.contains("the state of the cell changed"), "{message}");
+    assert!(reason(now).1);
+    shown.run.until("the reason on the page", |_| page(&visitor).contains("burnt smell").then_some(()));
+    assert!(!page(&visitor).contains("id=\"hold-reason\""));
+    assert_eq!(number(&status()), now, "the state is the same");
+    shown.run.signal("KILL");
 }
