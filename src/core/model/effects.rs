@@ -42,9 +42,9 @@ impl EffectEstimates {
         let most = n.min(MAX_POINTS);
         let chosen: Vec<usize> = (0..most).map(|k| k * n / most.max(1)).collect();
         let some = observed.subset(&chosen);
-        let fields = FieldHypotheses::over(&some, NoiseKind::PLAIN)?;
         // A smooth field is overconfident if the form is rough; rougher fields are conservative.
         let rough = |smoothness| smoothness == Smoothness::Matern2;
+        let fields = FieldHypotheses::of_smoothness(&some, NoiseKind::PLAIN, rough)?;
         let mut likely = Posterior::new(&fields, &some, Some(priors), None).weighted_hyperparameters(rough);
         likely.retain(|(_, weight)| *weight > MIN_PROBABILITY_SHARE);
         let whole: f64 = likely.iter().map(|(_, weight)| weight).sum();

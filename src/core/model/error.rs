@@ -46,6 +46,11 @@ pub enum ModelError {
     )]
     CollinearEffects,
     #[error(
+        "the eigenproblem of a field with the range {range_mm} mm has no solution in floating-point numbers; remove \
+         points whose deviations or places differ by many orders of magnitude from the others"
+    )]
+    Eigenproblem { range_mm: f64 },
+    #[error(
         "the points belong to {sessions} session; at least {min_sessions} are required for the variance between \
          sessions; measure once more, or from another station"
     )]

@@ -104,19 +104,19 @@ impl Form {
             seen.with_unexplained_points(apart, drawn.with_unresolved_form(&seen.observed, &posterior, inputs), inputs)
                 .after_best_fit()
         };
-        let drawn = of(posterior.samples(HypothesisSet::All, SAMPLES, 1), true);
+        let drawn = of(posterior.samples(HypothesisSet::All, SAMPLES, 1)?, true);
         let slope = seen.slope(inputs, &posterior, &drawn);
         let drawn = whole(drawn, &seen.unexplained, inputs);
         let form = if seen.is_chance { &[][..] } else { &seen.confirmed };
         let least = whole(
-            of(posterior.samples(HypothesisSet::Smooth, BOUND_SAMPLES, 2), false),
+            of(posterior.samples(HypothesisSet::Smooth, BOUND_SAMPLES, 2)?, false),
             form,
             &min_form_inputs(&posterior, inputs),
         )
         .figures_at_places();
         let most = match posterior.rough_probability() > MIN_PROBABILITY {
             true => {
-                whole(of(posterior.samples(HypothesisSet::Rough, BOUND_SAMPLES, 3), false), &seen.unexplained, inputs)
+                whole(of(posterior.samples(HypothesisSet::Rough, BOUND_SAMPLES, 3)?, false), &seen.unexplained, inputs)
                     .figures_at_places()
             }
             false => Vec::new(),
@@ -162,7 +162,7 @@ impl Form {
         // If there are many more places than touches, the places are close enough to each other.
         let is_between = places.len() < 2 * seen.inliers.len();
         let at = places.iter().map(xy).collect();
-        let drawn = seen.evaluate_samples(posterior.samples(HypothesisSet::All, SAMPLES, 1), at, effects, is_between);
+        let drawn = seen.evaluate_samples(posterior.samples(HypothesisSet::All, SAMPLES, 1)?, at, effects, is_between);
         let drawn = SampledForms { untouched: (0..places.len()).collect(), ..drawn };
         let drawn = drawn.rough_where_touched(&seen.observed.places).with_smooth_sigma(&seen.observed);
         let ground_in = seen.ground_in.is_some().then(|| seen.machine_effects.columns(places.iter().copied()));

@@ -8,7 +8,8 @@
 //!  R K R = U diag(l) U'                 R = 1 - Q Q', Q an orthonormal base of W H; K: covariance of W f for one node
 //! ```
 //!
-//! A node is one smoothness and one range. After one eigenproblem for the node, each variance ratio costs O(n):
+//! A node is one smoothness and one range. After one reduction to a tridiagonal form for the node ([`TridiagonalForm`]),
+//! each variance ratio costs O(n). In terms of the eigenvectors, which only samples of the node need:
 //!
 //! ```text
 //!  v = U'R W d
@@ -25,14 +26,16 @@
 
 use std::f64::consts::LN_2;
 use std::ops::Range;
+use std::sync::OnceLock;
 
 use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
-use faer::{Accum, Mat, Par, Side};
+use faer::{Accum, Mat, Par};
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
 use super::basis::Basis;
+use super::tridiagonal::{Eigenpairs, ShiftedFactor, TridiagonalForm};
 use super::{Anisotropy, ModelError, Observations, Smoothness, orthonormal_base, spacing_mm};
 
 /// Smoothnesses of the hypotheses, from rough to smooth.
@@ -110,7 +113,7 @@ struct Reduced {
     pivots: Option<Vec<usize>>,
 }
 
-/// Node: one smoothness and one range, with the solution of its eigenproblem.
+/// Node: one smoothness and one range, with the covariance of its field in a form that is easily inverted.
 pub(super) struct FieldHypothesis {
     pub(super) smoothness: Smoothness,
     pub(super) range_mm: f64,
@@ -120,12 +123,39 @@ pub(super) struct FieldHypothesis {
     pub(super) truncated_variance: f64,
     /// Factor by which tau s^2 is multiplied to give the variance of the field.
     pub(super) scale: f64,
+    /// Products C'C of the rows C of the node if it has fewer basis functions than coordinates, otherwise C C'. Without
+    /// the truncated variance, and before scaling.
+    products: TridiagonalForm,
+    /// True if the products are C'C.
+    by_waves: bool,
+    components: OnceLock<Option<Components>>,
+    /// Logarithm of the prior of each variance ratio.
+    pub(super) prior: Vec<f64>,
+}
+
+/// Principal components of the field of a node: the solution of its eigenproblem.
+pub(super) struct Components {
     /// Eigenvalues l before scaling and without the truncated variance.
     pub(super) eigenvalues: Vec<f64>,
     /// Eigenvectors U in the coordinates.
     pub(super) eigenvectors: Mat<f64>,
-    /// Logarithm of the prior of each variance ratio.
-    pub(super) prior: Vec<f64>,
+}
+
+/// Columns of reduced coordinates, seen through the tridiagonal form of a node.
+pub(super) struct Projected {
+    /// Q'C' or Q' times the columns: one row for each row of the tridiagonal form.
+    rotated: Mat<f64>,
+    /// Products of all pairs of columns; without those of `rotated` if the products of the node are C C'.
+    rest: DMatrix<f64>,
+}
+
+/// Covariance of field and noise for one node and one variance ratio, for noise of variance 1.
+pub(super) struct NodeCovariance {
+    /// Variance of the noise and of the waves that are as independent as noise.
+    noise: f64,
+    /// Factor on the products of the node.
+    field: f64,
+    factor: ShiftedFactor,
 }
 
 /// Returns the variance ratios at which every field hypothesis (a smoothness and a range of the random field) is
@@ -138,7 +168,7 @@ pub(super) fn variance_ratios() -> impl Iterator<Item = f64> {
 
 impl FieldHypotheses {
     /// Prepares all hypotheses of the field for the observed points. A hypothesis (node) is one smoothness with one
-    /// range. Solves one eigenproblem for each node.
+    /// range. Reduces one covariance to tridiagonal form for each node.
     ///
     /// `kind` has the anisotropy of the field and the autocorrelation of the noise. The deviations in `observed` are
     /// not used, but they must be finite. Nodes without a solution are left out.
@@ -147,9 +177,23 @@ impl FieldHypotheses {
     /// Returns an error if the numbers of rows differ, if a number is not finite, if there are not more points than
     /// fixed effects, or if the fixed effects are linearly dependent.
     pub(super) fn over(observed: &Observations, kind: NoiseKind) -> Result<Self, ModelError> {
+        Self::of_smoothness(observed, kind, |_| true)
+    }
+
+    /// Prepares the hypotheses of [`Self::over`] with a smoothness for which `is_of` returns true.
+    ///
+    /// # Errors
+    /// Returns the errors of [`Self::over`].
+    pub(super) fn of_smoothness(
+        observed: &Observations,
+        kind: NoiseKind,
+        is_of: impl Fn(Smoothness) -> bool,
+    ) -> Result<Self, ModelError> {
         let mut fields = Self::without_nodes(observed, kind)?;
         // Rough fields hardly differ from one range to the next, and cost most: every second range is enough.
-        let is_laid = |k: usize, smoothness: Smoothness| smoothness != Smoothness::Exponential || k.is_multiple_of(2);
+        let is_laid = |k: usize, smoothness: Smoothness| {
+            is_of(smoothness) && (smoothness != Smoothness::Exponential || k.is_multiple_of(2))
+        };
         let all = fields.ranges_mm().enumerate().flat_map(|(k, range_mm)| SMOOTHNESSES.map(|of| (k, of, range_mm)));
         let all: Vec<_> = all.filter(|&(k, smoothness, _)| is_laid(k, smoothness)).collect();
         let node = |&(_, smoothness, range_mm): &(usize, Smoothness, f64)| fields.node(smoothness, range_mm);
@@ -322,32 +366,82 @@ impl FieldHypotheses {
         (coordinates, products)
     }
 
-    /// Solves the eigenproblem of one node: a field with the given smoothness, and with the range `range_mm` in mm.
-    /// Returns `None` if nothing of this field remains at the points after the best fit of the fixed effects, or if the
-    /// eigenproblem has no solution.
+    /// Prepares one node: a field with the given smoothness, and with the range `range_mm` in mm. Returns `None` if
+    /// nothing of this field remains at the points after the best fit of the fixed effects.
     fn node(&self, smoothness: Smoothness, range_mm: f64) -> Option<FieldHypothesis> {
         let (mut strengths, narrow) = self.basis.standard_deviations(smoothness, range_mm);
         let least = MIN_SIGMA_SHARE * strengths.iter().copied().fold(0.0, f64::max);
         let last = strengths.iter().rposition(|strength| *strength > least);
         strengths.truncate(last.map_or(0, |last| last + 1));
-        let (r, c) = (self.reduced.rows.nrows(), strengths.len());
-        let rows = Mat::from_fn(r, c, |k, wave| self.reduced.rows[(k, wave)] * strengths[wave]);
-        let by_waves = c < r;
-        let mut products = Mat::zeros(c.min(r), c.min(r));
+        let rows = self.scaled_rows(&strengths);
+        let by_waves = rows.ncols() < rows.nrows();
+        let size = rows.ncols().min(rows.nrows());
+        let mut products = Mat::zeros(size, size);
         match by_waves {
             true => lower_product(&mut products, &rows),
             false => lower_product(&mut products, &rows.transpose().to_owned()),
         }
-        let eigen = products.self_adjoint_eigen(Side::Lower).ok()?;
-        let (all, found) = (eigen.S().column_vector(), eigen.U());
-        let top = (0..all.nrows()).map(|k| all[k]).fold(0.0, f64::max);
-        let kept: Vec<usize> = (0..all.nrows()).filter(|&k| all[k] > 1e-7 * top && all[k] > 0.0).collect();
-        let values: Vec<f64> = kept.iter().map(|&k| all[k]).collect();
-        let first = all.nrows() - kept.len();
-        let found = found.subcols(first, kept.len());
-        let vectors = match by_waves {
+        let products = TridiagonalForm::reduce(products);
+        let n = self.places.len() as f64;
+        let whole = products.trace() + narrow * self.degrees_of_freedom;
+        let scale = n / whole;
+        let mut node = FieldHypothesis {
+            smoothness,
+            range_mm,
+            standard_deviations: strengths,
+            truncated_variance: narrow,
+            scale,
+            products,
+            by_waves,
+            components: OnceLock::new(),
+            prior: Vec::new(),
+        };
+        if !(whole.is_finite() && whole > 0.0) {
+            return None;
+        }
+        node.prior = node.log_prior(self.degrees_of_freedom);
+        Some(node)
+    }
+
+    /// Returns the rows C of a node: the basis functions in the reduced coordinates, each times its standard deviation
+    /// in `strengths`.
+    fn scaled_rows(&self, strengths: &[f64]) -> Mat<f64> {
+        Mat::from_fn(self.reduced.rows.nrows(), strengths.len(), |k, wave| {
+            self.reduced.rows[(k, wave)] * strengths[wave]
+        })
+    }
+
+    /// Projects the columns `coordinates` on the tridiagonal form of `node`. `products` has the products of all pairs of
+    /// these columns. Both are those of [`Self::coordinates`].
+    pub(super) fn projected(
+        &self,
+        node: &FieldHypothesis,
+        coordinates: &Mat<f64>,
+        products: &DMatrix<f64>,
+    ) -> Projected {
+        if node.by_waves {
+            let by_waves = self.scaled_rows(&node.standard_deviations).transpose() * coordinates;
+            return Projected { rotated: node.products.rotate(&by_waves), rest: products.clone() };
+        }
+        let seen = coordinates.transpose() * coordinates;
+        let rest = DMatrix::from_fn(products.nrows(), products.ncols(), |a, b| products[(a, b)] - seen[(a, b)]);
+        Projected { rotated: node.products.rotate(coordinates), rest }
+    }
+
+    /// Returns the principal components of the field of `node`. They are computed when they are first asked for.
+    /// Returns `None` if the eigenproblem has no solution.
+    pub(super) fn components<'n>(&self, node: &'n FieldHypothesis) -> Option<&'n Components> {
+        node.components.get_or_init(|| self.solve_eigenproblem(node)).as_ref()
+    }
+
+    fn solve_eigenproblem(&self, node: &FieldHypothesis) -> Option<Components> {
+        let Eigenpairs { values: all, vectors: found } = node.products.eigenpairs()?;
+        let top = all.iter().copied().fold(0.0, f64::max);
+        let values: Vec<f64> = all.iter().copied().filter(|l| *l > 1e-7 * top && *l > 0.0).collect();
+        let found = found.subcols(all.len() - values.len(), values.len());
+        let vectors = match node.by_waves {
             true => {
-                let mut vectors = &rows * found;
+                let mut vectors = self.scaled_rows(&node.standard_deviations) * found;
                 for (k, value) in values.iter().enumerate() {
                     let by = value.sqrt().recip();
                     vectors.col_as_slice_mut(k).iter_mut().for_each(|v| *v *= by);
@@ -356,20 +450,32 @@ impl FieldHypotheses {
             }
             false => found.to_owned(),
         };
-        let n = self.places.len() as f64;
-        let whole = values.iter().sum::<f64>() + narrow * self.degrees_of_freedom;
-        let scale = n / whole;
-        let prior = log_prior(&values, narrow, scale, self.degrees_of_freedom);
-        (whole.is_finite() && whole > 0.0).then_some(FieldHypothesis {
-            smoothness,
-            range_mm,
-            standard_deviations: strengths,
-            truncated_variance: narrow,
-            scale,
-            eigenvalues: values,
-            eigenvectors: vectors,
-            prior,
-        })
+        Some(Components { eigenvalues: values, eigenvectors: vectors })
+    }
+
+    /// Returns the posterior mean of the coefficients of the basis functions at the variance ratio `tau`: D C'K^-1 z.
+    /// Here z is the sum of the columns of `projected`, each times its element of `weights`, and K is the covariance of
+    /// field and noise in units of the variance of the field. The result has one value for each basis function of
+    /// `node`.
+    pub(super) fn mean_coefficients(
+        &self,
+        (node, tau): (&FieldHypothesis, f64),
+        projected: &Projected,
+        weights: &[f64],
+    ) -> Vec<f64> {
+        let NodeCovariance { field, factor, .. } = node.covariance(tau);
+        let column: Vec<f64> = (0..projected.rotated.nrows())
+            .map(|k| weights.iter().enumerate().map(|(c, weight)| weight * projected.rotated[(k, c)]).sum())
+            .collect();
+        let solved = factor.solve(&column);
+        let solved = node.products.rotate_back(&Mat::from_fn(solved.len(), 1, |k, _| field * solved[k]));
+        let mut coefficients = match node.by_waves {
+            true => solved,
+            false => self.coefficients_from(node, &solved),
+        };
+        let column = coefficients.col_as_slice_mut(0);
+        column.iter_mut().zip(&node.standard_deviations).for_each(|(value, d)| *value *= d);
+        column.to_vec()
     }
 
     /// Maps values in reduced coordinates to coefficients of the basis functions. There is one reduced coordinate for
@@ -460,35 +566,50 @@ impl FieldHypotheses {
     }
 }
 
-/// Returns the logarithm of the prior probability of each variance ratio tau, up to a constant, for one node (one
-/// smoothness with one range). tau is the variance of the field divided by the variance of the noise. The order is that
-/// of [`variance_ratios`].
-///
-/// - `values` are the eigenvalues of the node.
-/// - `narrow` is the variance of the waves shorter than the basis functions, in a field of variance 1.
-/// - `scale` is the factor that converts tau s^2 to the variance of the field, where s is the standard deviation of the
-///   noise ([`FieldHypothesis::scale`]).
-/// - `free` is n - p, the number of points minus the number of fixed effects.
-///
-/// The prior is J / (1 + J), where J^2 is the Fisher information on ln tau (a bounded Jeffreys prior). Let l = scale
-/// (eigenvalue + narrow) and q = l tau / (1 + l tau). Then J^2 = (sum q^2 - (sum q)^2 / (n - p)) / 2. The sums have n -
-/// p terms. Terms beyond the number of `values` have the eigenvalue 0. A field that cannot be distinguished from noise
-/// has J = 0.
-fn log_prior(values: &[f64], narrow: f64, scale: f64, free: f64) -> Vec<f64> {
-    let of = |tau: f64| {
-        let share = |l: f64| l * tau / (1.0 + l * tau);
-        let rest = free - values.len() as f64;
-        let alike = share(scale * narrow);
-        let (mut sum, mut squares) = (rest * alike, rest * alike * alike);
-        for l in values {
-            let q = share(scale * (l + narrow));
-            sum += q;
-            squares += q * q;
-        }
-        let told = (0.5 * (squares - sum * sum / free)).max(0.0).sqrt();
-        (told / (1.0 + told)).max(f64::MIN_POSITIVE).ln()
-    };
-    variance_ratios().map(of).collect()
+impl FieldHypothesis {
+    /// Returns the covariance of field and noise at the variance ratio `tau` of field to noise.
+    pub(super) fn covariance(&self, tau: f64) -> NodeCovariance {
+        let noise = 1.0 + self.scale * self.truncated_variance * tau;
+        let field = self.scale * tau;
+        NodeCovariance { noise, field, factor: self.products.shifted(noise, field) }
+    }
+
+    /// Returns the logarithm of the prior probability of each variance ratio tau, up to a constant. tau is the variance
+    /// of the field divided by the variance of the noise. The order is that of [`variance_ratios`]. `free` is n - p,
+    /// the number of points minus the number of fixed effects.
+    ///
+    /// The prior is J / (1 + J), where J^2 is the Fisher information on ln tau (a bounded Jeffreys prior). Let l = scale
+    /// (eigenvalue + truncated variance) and q = l tau / (1 + l tau). Then J^2 = (sum q^2 - (sum q)^2 / (n - p)) / 2.
+    /// The sums have n - p terms. Terms beyond the size of the products have the eigenvalue 0. The others follow from
+    /// the traces of the inverse of the covariance, because q = 1 - 1 / (1 + l tau). A field that cannot be
+    /// distinguished from noise has little prior probability.
+    fn log_prior(&self, free: f64) -> Vec<f64> {
+        let size = self.products.size() as f64;
+        let of = |tau: f64| {
+            let NodeCovariance { noise, factor, .. } = self.covariance(tau);
+            let [inverse, inverse2] = factor.inverse_traces();
+            let alike = 1.0 - noise.recip();
+            let sum = (free - size) * alike + size - inverse;
+            let squares = (free - size) * alike * alike + size - 2.0 * inverse + inverse2;
+            let told = (0.5 * (squares - sum * sum / free)).max(0.0).sqrt();
+            (told / (1.0 + told)).max(f64::MIN_POSITIVE).ln()
+        };
+        variance_ratios().map(of).collect()
+    }
+}
+
+impl NodeCovariance {
+    /// Returns the logarithm of the determinant of the covariance K0 with `free` degrees of freedom.
+    pub(super) fn log_determinant(&self, free: f64) -> f64 {
+        (free - self.factor.size() as f64) * self.noise.ln() + self.factor.log_determinant()
+    }
+
+    /// Returns the products a'K0^-1 b of all pairs of the columns that were projected on the node.
+    pub(super) fn products(&self, node: &FieldHypothesis, columns: &Projected) -> DMatrix<f64> {
+        // C'C: (noise I + field C C')^-1 = (I - field C (noise I + field C'C)^-1 C') / noise
+        let weight = if node.by_waves { -self.field / self.noise } else { 1.0 };
+        &columns.rest / self.noise + self.factor.products(&columns.rotated) * weight
+    }
 }
 
 /// Adds the product R'R to the lower triangle of `products`, where R is the matrix `rows` and R' is its transpose.

@@ -46,6 +46,7 @@ mod random_normals;
 mod sampled_forms;
 mod sessions;
 mod stopping;
+mod tridiagonal;
 
 pub use area_figures::{AngleInterval, IsoFigures, SlopeFigures};
 pub use budget::BudgetEntry;

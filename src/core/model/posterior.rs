@@ -13,7 +13,7 @@ use faer::Mat;
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 use rayon::prelude::*;
 
-use super::hypotheses::{FieldHypotheses, FieldHypothesis, NoiseKind, variance_ratios};
+use super::hypotheses::{Components, FieldHypotheses, FieldHypothesis, NoiseKind, Projected, variance_ratios};
 use super::noise_kind::candidates;
 use super::random_normals::NormalGenerator;
 use super::{Field, Hyperparameters, ModelError, Observations, Prior, Smoothness};
@@ -56,21 +56,15 @@ pub(super) struct Posterior<'f> {
     pub(super) fields: &'f FieldHypotheses,
     observed: &'f Observations,
     probe: NoisePrior,
-    /// Projections U' of the deviations and of the random effects, for each node.
+    /// Reduced coordinates of the deviations (first column) and of the random effects.
+    coordinates: Mat<f64>,
+    /// Projections of these columns for each node.
     projected: Vec<Projected>,
     /// Logarithm of the posterior density: one vector for each node, one value for each variance ratio.
     densities: Vec<Vec<f64>>,
     /// Logarithm of the likelihood ratio of the best field and no field.
     pub(super) evidence: f64,
     squares: f64,
-}
-
-/// Projections for one node: the first column is that of the deviations, the others are those of the random effects.
-struct Projected {
-    /// Projections U' of the columns: one row for each eigenvector.
-    v: Mat<f64>,
-    /// Products of all pairs of columns, minus the products of all pairs of their projections `v`.
-    rest: DMatrix<f64>,
 }
 
 /// Set of fields to sample from.
@@ -144,18 +138,13 @@ impl<'f> Posterior<'f> {
             c => observed.random_effects[(r, c - 1)],
         });
         let (coordinates, products) = fields.coordinates(&columns);
-        let see = |node: &FieldHypothesis| {
-            let v = node.eigenvectors.transpose() * &coordinates;
-            let rest = DMatrix::from_fn(1 + stated, 1 + stated, |a, b| {
-                products[(a, b)] - (0..v.nrows()).map(|k| v[(k, a)] * v[(k, b)]).sum::<f64>()
-            });
-            Projected { v, rest }
-        };
+        let see = |node: &FieldHypothesis| fields.projected(node, &coordinates, &products);
         let seen: Vec<Projected> = fields.hypotheses.iter().map(see).collect();
         let posterior = Self {
             fields,
             observed,
             probe,
+            coordinates,
             projected: seen,
             densities: Vec::new(),
             evidence: 0.0,
@@ -195,21 +184,10 @@ impl<'f> Posterior<'f> {
     /// Returns the likelihood as a function of the standard deviation of the noise. The field is given by the node
     /// (smoothness with range) with the index `node`, and by the variance ratio `tau` of field to noise.
     fn noise_likelihood(&self, node: usize, tau: f64) -> NoiseLikelihood {
-        let (FieldHypothesis { eigenvalues: values, truncated_variance: narrow, scale, .. }, Projected { v, rest }) =
-            (&self.fields.hypotheses[node], &self.projected[node]);
-        let stated = rest.nrows() - 1;
-        let alike = 1.0 + scale * narrow * tau;
-        let mut products = rest / alike;
-        let mut logs = (self.fields.degrees_of_freedom - values.len() as f64) * alike.ln();
-        for (k, l) in values.iter().enumerate() {
-            let own = 1.0 + scale * (l + narrow) * tau;
-            logs += own.ln();
-            for a in 0..=stated {
-                for b in 0..=stated {
-                    products[(a, b)] += v[(k, a)] * v[(k, b)] / own;
-                }
-            }
-        }
+        let (node, columns) = (&self.fields.hypotheses[node], &self.projected[node]);
+        let covariance = node.covariance(tau);
+        let products = covariance.products(node, columns);
+        let logs = covariance.log_determinant(self.fields.degrees_of_freedom);
         NoiseLikelihood::new(&products, logs, self.fields.degrees_of_freedom, self.probe)
     }
 
@@ -341,7 +319,15 @@ impl<'f> Posterior<'f> {
     /// multiplies the variance of the field ([`HypothesisSet`]).
     ///
     /// The same `seed` gives the same samples. The result is empty if the set has no field.
-    pub(super) fn samples(&self, which: HypothesisSet, count: usize, seed: u64) -> PosteriorSamples {
+    ///
+    /// # Errors
+    /// Returns an error if the eigenproblem of a field has no solution.
+    pub(super) fn samples(
+        &self,
+        which: HypothesisSet,
+        count: usize,
+        seed: u64,
+    ) -> Result<PosteriorSamples, ModelError> {
         let probabilities = self.probabilities(which);
         // Equal steps through the cumulative probability: the count of each field is within one of its expected value.
         let mut chosen: Vec<(usize, f64, usize)> = Vec::with_capacity(count);
@@ -362,8 +348,14 @@ impl<'f> Posterior<'f> {
         }
         let nodes: Vec<&[(usize, f64, usize)]> =
             chosen.chunk_by(|a, b| a.0 == b.0).flat_map(|of| of.chunks(64)).collect();
+        // Each eigenproblem once, before several chunks ask for the same one.
+        let mut sampled: Vec<usize> = nodes.iter().map(|of| of[0].0).collect();
+        sampled.dedup();
+        sampled.par_iter().for_each(|&number| {
+            self.fields.components(&self.fields.hypotheses[number]);
+        });
         let made: Vec<PosteriorSamples> =
-            nodes.par_iter().map(|of| self.samples_of(of[0].0, of, (which, seed))).collect();
+            nodes.par_iter().map(|of| self.samples_of(of[0].0, of, (which, seed))).collect::<Result<_, _>>()?;
         let mut draws = PosteriorSamples {
             coefficients: [0, 1].map(|_| Mat::zeros(self.fields.basis.len(), chosen.len())),
             noise_mm: Vec::new(),
@@ -381,7 +373,7 @@ impl<'f> Posterior<'f> {
             draws.noise_mm.extend(of.noise_mm);
             draws.truncated_mm.iter_mut().zip(of.truncated_mm).for_each(|(into, from)| into.extend(from));
         }
-        draws
+        Ok(draws)
     }
 
     /// Draws posterior samples for one node (smoothness with range). Returns the samples in the order of `chosen`.
@@ -400,9 +392,12 @@ impl<'f> Posterior<'f> {
         number: usize,
         chosen: &[(usize, f64, usize)],
         (which, seed): (HypothesisSet, u64),
-    ) -> PosteriorSamples {
-        let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.projected[number]);
-        let (waves, seen, count) = (node.standard_deviations.len(), node.eigenvalues.len(), chosen.len());
+    ) -> Result<PosteriorSamples, ModelError> {
+        let node = &self.fields.hypotheses[number];
+        let Components { eigenvalues, eigenvectors } =
+            self.fields.components(node).ok_or(ModelError::Eigenproblem { range_mm: node.range_mm })?;
+        let v = eigenvectors.transpose() * &self.coordinates;
+        let (waves, seen, count) = (node.standard_deviations.len(), eigenvalues.len(), chosen.len());
         let mut streams: Vec<NormalGenerator> =
             chosen.iter().map(|(.., k)| NormalGenerator::new(seed, *k as u64)).collect();
         let told: Vec<(f64, DVector<f64>)> = chosen
@@ -420,11 +415,11 @@ impl<'f> Posterior<'f> {
             before.col_as_slice_mut(c).iter_mut().for_each(|value| *value = normals.next());
             by_points.col_as_slice_mut(c).iter_mut().for_each(|value| *value = normals.next());
         }
-        let of_before = node.eigenvectors.transpose() * self.fields.coordinates_from(node, &before);
+        let of_before = eigenvectors.transpose() * self.fields.coordinates_from(node, &before);
         let strength2 = |c: usize, under: f64| under * chosen[c].1 * node.scale * told[c].0.powi(2);
         let of = |under: f64| {
             let left = Mat::from_fn(seen, count, |k, c| {
-                let (scatter2, field2, l) = (told[c].0.powi(2), strength2(c, under), node.eigenvalues[k]);
+                let (scatter2, field2, l) = (told[c].0.powi(2), strength2(c, under), eigenvalues[k]);
                 let found = v[(k, 0)] - (0..told[c].1.len()).map(|e| told[c].1[e] * v[(k, 1 + e)]).sum::<f64>();
                 let all = field2 * (l + node.truncated_variance) + scatter2;
                 // Mean and standard deviation of l^(1/2) w.
@@ -432,7 +427,7 @@ impl<'f> Posterior<'f> {
                 let spread = (field2 * l * (field2 * node.truncated_variance + scatter2) / all).sqrt();
                 (mean + spread * by_points[(k, c)] - field2.sqrt() * of_before[(k, c)]) / l
             });
-            let mut coefficients = self.fields.coefficients_from(node, &(&node.eigenvectors * left));
+            let mut coefficients = self.fields.coefficients_from(node, &(eigenvectors * left));
             for c in 0..count {
                 let sigma_mm = strength2(c, under).sqrt();
                 let column = coefficients.col_as_slice_mut(c).iter_mut().zip(before.col_as_slice(c));
@@ -443,12 +438,12 @@ impl<'f> Posterior<'f> {
         let narrow_mm = which
             .variance_factors(node.smoothness)
             .map(|under| (0..count).map(|c| (strength2(c, under) * node.truncated_variance).sqrt()).collect());
-        PosteriorSamples {
+        Ok(PosteriorSamples {
             coefficients: which.variance_factors(node.smoothness).map(of),
             random_effects: DMatrix::from_fn(self.observed.random_effects.ncols(), count, |e, c| told[c].1[e]),
             noise_mm: told.into_iter().map(|(scatter_mm, _)| scatter_mm).collect(),
             truncated_mm: narrow_mm,
-        }
+        })
     }
 
     /// Returns the posterior mean for the most probable hypothesis. The first result has the coefficients of the basis
@@ -459,18 +454,12 @@ impl<'f> Posterior<'f> {
         let Some((number, tau)) = self.most_probable() else {
             return (waves, DVector::zeros(self.observed.random_effects.ncols()));
         };
-        let (node, Projected { v, .. }) = (&self.fields.hypotheses[number], &self.projected[number]);
         let scale = self.noise_likelihood(number, tau);
-        let scatter_mm = scale.mode_mm();
-        let stated = scale.random_effects_mode(scatter_mm);
-        let field2 = tau * node.scale;
-        let left = Mat::from_fn(node.eigenvalues.len(), 1, |k, _| {
-            let found = v[(k, 0)] - (0..stated.len()).map(|e| stated[e] * v[(k, 1 + e)]).sum::<f64>();
-            field2 / (field2 * (node.eigenvalues[k] + node.truncated_variance) + 1.0) * found
-        });
-        let coefficients = self.fields.coefficients_from(node, &(&node.eigenvectors * left));
-        let strong = coefficients.col_as_slice(0).iter().zip(&node.standard_deviations);
-        waves.iter_mut().zip(strong).for_each(|(into, (of, d))| *into = of * d);
+        let stated = scale.random_effects_mode(scale.mode_mm());
+        let weights: Vec<f64> = std::iter::once(1.0).chain(stated.iter().map(|effect| -effect)).collect();
+        let node = &self.fields.hypotheses[number];
+        let coefficients = self.fields.mean_coefficients((node, tau), &self.projected[number], &weights);
+        waves.iter_mut().zip(coefficients).for_each(|(into, of)| *into = of);
         (waves, stated)
     }
 
