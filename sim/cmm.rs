@@ -20,10 +20,11 @@ use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
 
 use crate::body::{Kind, Payload, Payloads, Physics, Progress, Refusal, ResultData};
+use crate::machine_spec::{CmmSpec, REFERENCE_C};
 use crate::part::{Approach, Contact, touch_sphere};
 use crate::payload::{BROKEN, Feature, INTERLOCK, Plan, PointRecord, Status, Target, encode_points, outside};
 use crate::probe::Placement;
-use crate::spec::{CmmSpec, REFERENCE_C, WorldFaults};
+use crate::spec::WorldFaults;
 use crate::truth::{Source, WorldState, empty_result, locked, stream};
 use crate::vector::{distance, length};
 use crate::{Rng, Vec3};

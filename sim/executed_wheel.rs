@@ -254,9 +254,10 @@ impl Wheel {
     /// on the next track. Ignores the present track if the wheel has not moved along x near the part.
     fn end_track(&mut self, state: &mut WorldState) {
         let feet = std::mem::take(&mut self.projections);
-        let [half_x, half_y] = state.part.aperture.half_mm();
+        let [[min_x, max_x], [min_y, max_y]] = state.part.aperture.bounds_mm();
         let on_part = |foot: &&WheelProjection| {
-            foot.position_mm[0].abs() <= half_x && foot.position_mm[1].abs() <= half_y + OUTER_STRIP_MM
+            (min_x..=max_x).contains(&foot.position_mm[0])
+                && (min_y - OUTER_STRIP_MM..=max_y + OUTER_STRIP_MM).contains(&foot.position_mm[1])
         };
         // The mean is over the length, because the wheel can slow down and stop anywhere on the track.
         let on: Vec<&WheelProjection> = feet.iter().filter(on_part).collect();

@@ -24,8 +24,15 @@ impl FormError {
     /// `width_mm` by `depth_mm`, centred on the origin. `correlation_length_mm` is the distance at which the
     /// autocovariance has fallen to 1/e.
     pub fn new(seed: u64, correlation_length_mm: f64, pv_mm: f64, width_mm: f64, depth_mm: f64) -> Self {
+        let bounds_mm = [width_mm, depth_mm].map(|size_mm| [-0.5 * size_mm, 0.5 * size_mm]);
+        Self::over(seed, correlation_length_mm, pv_mm, bounds_mm)
+    }
+
+    /// Draws a random form error from `seed`, as [`Self::new`] does, over a rectangle that can be anywhere.
+    /// `bounds_mm` has the minimum and the maximum of x, and those of y.
+    pub fn over(seed: u64, correlation_length_mm: f64, pv_mm: f64, bounds_mm: [[f64; 2]; 2]) -> Self {
         let mut error = Self::with_amplitude(&mut crate::rng(seed), correlation_length_mm, 1.0);
-        let (low, high) = error.extremes(width_mm, depth_mm);
+        let (low, high) = error.extremes(bounds_mm);
         for wave in &mut error.waves {
             wave[3] = pv_mm / (high - low);
         }
@@ -92,11 +99,11 @@ impl FormError {
         })
     }
 
-    fn extremes(&self, width_mm: f64, depth_mm: f64) -> (f64, f64) {
-        let at = |i: i32, size: f64| size * (f64::from(i) / 100.0 - 0.5);
+    fn extremes(&self, [x_mm, y_mm]: [[f64; 2]; 2]) -> (f64, f64) {
+        let at = |i: i32, [min, max]: [f64; 2]| 0.5 * (min + max) + (max - min) * (f64::from(i) / 100.0 - 0.5);
         (0..=100)
             .flat_map(|j| (0..=100).map(move |i| (i, j)))
-            .map(|(i, j)| self.height(at(i, width_mm), at(j, depth_mm)))
+            .map(|(i, j)| self.height(at(i, x_mm), at(j, y_mm)))
             .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), h| (low.min(h), high.max(h)))
     }
 }

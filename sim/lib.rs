@@ -44,6 +44,7 @@
 //! Units: millimetres and radians throughout. Frames: `shape` and `form` use the model frame; the points that a probe
 //! reports are in the frame of the measuring machine.
 
+pub mod aperture;
 pub mod body;
 pub mod cmm;
 pub mod command;
@@ -57,12 +58,15 @@ mod handshake;
 pub mod head;
 pub mod hits;
 pub mod line_server;
+pub mod machine_class;
+mod machine_spec;
 mod modbus;
 pub mod motion;
 pub mod options;
 pub mod part;
 pub mod payload;
 pub mod pending_faults;
+pub mod point_surface;
 pub mod probe;
 pub mod program;
 pub mod register_encoding;

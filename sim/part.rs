@@ -25,10 +25,14 @@
 //! strip, would lie in the strip of the other. A ball that is as blunt as the wheel or blunter reaches into no groove;
 //! it rides on the ridges, on the one that it meets first.
 
+use std::sync::Arc;
+
 use serde::{Deserialize, Serialize};
 
 use crate::Vec3;
+use crate::aperture::Aperture;
 use crate::form::FormError;
+use crate::point_surface::PointSurface;
 use crate::shape::{Biconic, FreeForm, OffAxisAsphere, Shape, Sphere, ThroughOrigin, Wave, XyPolynomial};
 use crate::vector::{cross, dot, length, unit_normal};
 
@@ -39,15 +43,19 @@ const MARGIN_NODES: usize = 2;
 
 /// Specification of the part and its blank.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct PartSpec {
-    /// Nominal shape of the part.
+    /// True shape of the part without errors. In a recipe, the default is the nominal surface.
     pub shape: ShapeSpec,
-    /// Outline of the part.
+    /// Outline of the part. In a recipe, the default is the outline of the nominal surface, or the convex hull of its
+    /// points.
     pub aperture: Aperture,
-    /// Height of the blank over the nominal surface before the first pass.
+    /// Height of the blank over the nominal surface before the first pass. In a recipe, the default is at most half of
+    /// the removal budget.
     pub stock_um: f64,
-    /// Peak to valley of the blank's form error.
+    /// Peak to valley of the blank's form error. In a recipe, the default is a tenth of the stock if the recipe states
+    /// no stock.
     pub form_error_um: f64,
     /// Correlation length of the blank's form error.
     pub form_error_correlation_mm: f64,
@@ -59,6 +67,7 @@ pub struct PartSpec {
 
 /// Local defect of the part: a broken-off piece, a pit, a scratch, or a deposit.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct DefectSpec {
     /// Middle of the defect in the model frame.
@@ -99,7 +108,7 @@ impl Default for PartSpec {
     fn default() -> Self {
         Self {
             shape: ShapeSpec::FreeForm {},
-            aperture: Aperture::Rectangle { half_x_mm: 51.0, half_y_mm: 31.0 },
+            aperture: Aperture::rectangle(51.0, 31.0),
             stock_um: 200.0,
             form_error_um: 20.0,
             form_error_correlation_mm: 30.0,
@@ -111,23 +120,24 @@ impl Default for PartSpec {
 
 /// Nominal surface, given by its parameters.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum ShapeSpec {
-    /// [`FreeForm`].
+    /// The free-form mirror of the shipped recipe.
     FreeForm {},
-    /// [`Sphere`].
+    /// A sphere.
     Sphere {
         /// Signed radius of curvature.
         radius_mm: f64,
     },
-    /// [`Biconic`].
+    /// Two conics, one in x and one in y.
     Biconic {
         /// Radii of curvature in x and y.
         radius_mm: [f64; 2],
         /// Conic constants in x and y.
         conic: [f64; 2],
     },
-    /// [`OffAxisAsphere`], moved along z so that the origin lies on the surface at the section's centre.
+    /// A section of an asphere away from its axis. The origin lies on the surface at the centre of the section.
     OffAxisAsphere {
         /// Vertex radius of the parent.
         radius_mm: f64,
@@ -139,22 +149,29 @@ pub enum ShapeSpec {
         /// Distance of the section's centre from the parent's axis, along x.
         shift_mm: f64,
     },
-    /// [`Wave`].
+    /// Shallow waves in x and y.
     Wave {
         /// Peak to valley.
         height_mm: f64,
     },
-    /// [`XyPolynomial`].
+    /// Powers of x and y.
     XyPolynomial {
         /// Divisor of x and y.
         normalisation_radius_mm: f64,
         /// The terms.
         coefficients: Vec<Coefficient>,
     },
+    /// The nominal surface of the recipe.
+    Nominal {
+        /// The points; none in a file.
+        #[serde(skip)]
+        points: Arc<[Vec3]>,
+    },
 }
 
 /// A term of an [`XyPolynomial`].
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Coefficient {
     /// Power of x.
@@ -180,42 +197,7 @@ impl ShapeSpec {
                 normalisation_radius_mm,
                 terms: coefficients.iter().map(|c| (c.i, c.j, c.value_mm)).collect(),
             }),
-        }
-    }
-}
-
-/// The outline of the part over the plane of the model frame, centred on the origin.
-#[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
-#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
-pub enum Aperture {
-    /// A rectangle.
-    Rectangle {
-        /// Half the width in x.
-        half_x_mm: f64,
-        /// Half the depth in y.
-        half_y_mm: f64,
-    },
-    /// A circle.
-    Circle {
-        /// Its radius.
-        radius_mm: f64,
-    },
-}
-
-impl Aperture {
-    /// Returns half the width (along x) and half the depth (along y) of the bounding rectangle of the aperture, in mm.
-    pub fn half_mm(&self) -> [f64; 2] {
-        match *self {
-            Self::Rectangle { half_x_mm, half_y_mm } => [half_x_mm, half_y_mm],
-            Self::Circle { radius_mm } => [radius_mm, radius_mm],
-        }
-    }
-
-    /// Returns true if the position (x, y) is inside the aperture.
-    pub fn contains(&self, x: f64, y: f64) -> bool {
-        match *self {
-            Self::Rectangle { half_x_mm, half_y_mm } => x.abs() <= half_x_mm && y.abs() <= half_y_mm,
-            Self::Circle { radius_mm } => x.hypot(y) <= radius_mm,
+            Self::Nominal { points } => Box::new(PointSurface::through(points.to_vec()).unwrap_or_default()),
         }
     }
 }
@@ -232,13 +214,13 @@ pub struct HeightGrid {
 }
 
 impl HeightGrid {
-    /// Creates a grid over a rectangle about the origin, whose half width and half depth are `half_mm`. All nodes have
-    /// the height `height_mm`.
-    pub fn new(half_mm: [f64; 2], height_mm: f64) -> Self {
+    /// Creates a grid over the bounding rectangle of `aperture`. All nodes have the height `height_mm`.
+    pub fn over(aperture: &Aperture, height_mm: f64) -> Self {
+        let (bounds_mm, half_mm) = (aperture.bounds_mm(), aperture.half_mm());
         let spacing = NODE_SPACING_MM.max(half_mm[0].max(half_mm[1]) / 200.0);
         let cells = half_mm.map(|half| ((2.0 * half / spacing).ceil() as usize).max(4));
         let step_mm = [0, 1].map(|i| 2.0 * half_mm[i] / cells[i] as f64);
-        let first_mm = [0, 1].map(|i| -half_mm[i] - MARGIN_NODES as f64 * step_mm[i]);
+        let first_mm = [0, 1].map(|i| bounds_mm[i][0] - MARGIN_NODES as f64 * step_mm[i]);
         let [columns, rows] = cells.map(|n| n + 1 + 2 * MARGIN_NODES);
         Self { first_mm, step_mm, columns, rows, heights_mm: vec![height_mm; columns * rows] }
     }
@@ -423,18 +405,17 @@ impl Part {
     /// Creates the blank of a part: the nominal surface with stock and with a random form error, which is drawn from a
     /// seed.
     pub fn blank(spec: &PartSpec, seed: u64) -> Self {
-        let mut height = HeightGrid::new(spec.aperture.half_mm(), spec.stock_um * 1e-3);
-        let [half_x, half_y] = spec.aperture.half_mm();
+        let mut height = HeightGrid::over(&spec.aperture, spec.stock_um * 1e-3);
         let form = if spec.form_error_um > 0.0 {
             let (length, pv) = (spec.form_error_correlation_mm, spec.form_error_um * 1e-3);
-            FormError::new(seed, length, pv, 2.0 * half_x, 2.0 * half_y)
+            FormError::over(seed, length, pv, spec.aperture.bounds_mm())
         } else {
             FormError::none()
         };
         let mut heights_mm = height.heights_mm.clone();
         height.add(&form, &mut heights_mm);
         height.heights_mm = heights_mm;
-        Self { shape: spec.shape.build(), aperture: spec.aperture, height, grooves: None }
+        Self { shape: spec.shape.build(), aperture: spec.aperture.clone(), height, grooves: None }
     }
 
     /// Returns the deviation of the real surface from the nominal surface at (x, y), in mm along the nominal normal.
@@ -717,7 +698,7 @@ mod tests {
     fn contact_on_a_sphere_is_concentric() {
         let spec = PartSpec {
             shape: ShapeSpec::Sphere { radius_mm: -80.0 },
-            aperture: Aperture::Circle { radius_mm: 30.0 },
+            aperture: Aperture::circle(30.0),
             stock_um: 50.0,
             form_error_um: 0.0,
             ..PartSpec::default()
@@ -753,7 +734,7 @@ mod tests {
     /// Returns a part with the grooves of a wheel.
     fn grooved(wheel_radius_mm: f64, spacing_mm: f64) -> Part {
         let mut part = rough_part();
-        let mut bend = HeightGrid::new(part.aperture.half_mm(), 0.0);
+        let mut bend = HeightGrid::over(&part.aperture, 0.0);
         bend.heights_mm = bend.nodes().map(|at| Grooves::bend_at(part.shape.as_ref(), wheel_radius_mm, at)).collect();
         part.grooves = Some(Grooves { first_mm: -32.6, spacing_mm, wheel_radius_mm, bend });
         part
@@ -835,7 +816,7 @@ mod tests {
     fn contact_missed_outside_sphere_domain() {
         let spec = PartSpec {
             shape: ShapeSpec::Sphere { radius_mm: 40.0 },
-            aperture: Aperture::Circle { radius_mm: 30.0 },
+            aperture: Aperture::circle(30.0),
             ..PartSpec::default()
         };
         let part = Part::blank(&spec, 1);

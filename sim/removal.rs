@@ -90,7 +90,7 @@ pub(crate) fn wheel_radius_mm(state: &WorldState, stated_mm: f64) -> f64 {
 /// where it cuts. Returns `None` if the specification has no grooves (`scallops` is false).
 pub(crate) fn groove_bend(state: &WorldState, radius_mm: f64) -> Option<HeightGrid> {
     state.spec.grinder.scallops.then(|| {
-        let mut bend = HeightGrid::new(state.part.aperture.half_mm(), 0.0);
+        let mut bend = HeightGrid::over(&state.part.aperture, 0.0);
         bend.heights_mm = bend.nodes().map(|at| Grooves::bend_at(state.part.shape.as_ref(), radius_mm, at)).collect();
         bend
     })
@@ -102,7 +102,7 @@ pub(crate) fn groove_bend(state: &WorldState, radius_mm: f64) -> Option<HeightGr
 pub(crate) fn place_grooves(state: &mut WorldState, [first_mm, spacing_mm]: [f64; 2], wheel_radius_mm: f64) {
     let before = state.part.grooves.take().map(|grooves| grooves.bend);
     if state.spec.grinder.scallops {
-        let bend = before.unwrap_or_else(|| HeightGrid::new(state.part.aperture.half_mm(), 0.0));
+        let bend = before.unwrap_or_else(|| HeightGrid::over(&state.part.aperture, 0.0));
         state.part.grooves = Some(Grooves { first_mm, spacing_mm, wheel_radius_mm, bend });
     }
 }
@@ -126,7 +126,7 @@ impl GrinderSpec {
     /// Returns the systematic error of the grinder at (x, y) of a part, in µm: setting, tilt, straightness and screw
     /// errors. The error of the wheel's radius is not included.
     fn systematic_um(&self, part: &Part, [x, y]: [f64; 2]) -> f64 {
-        let [half_x, half_y] = part.aperture.half_mm();
+        let ([half_x, half_y], [middle_x, middle_y]) = (part.aperture.half_mm(), part.aperture.middle_mm());
         let [p, q] = part.shape.gradient(x, y);
         let nz = 1.0 / (1.0 + p * p + q * q).sqrt();
         let [ex, ey] = self.setting_error_um;
@@ -138,7 +138,8 @@ impl GrinderSpec {
         let tilt = -nz * (about_x * (y + q * z) - about_y * (x + p * z));
         let straight =
             |t: f64, [second, third]: [f64; 2]| second * (1.5 * t * t - 0.5) + third * (2.5 * t * t * t - 1.5 * t);
-        let straightness = straight(x / half_x, self.straightness_x_um) + straight(y / half_y, self.straightness_y_um);
+        let straightness = straight((x - middle_x) / half_x, self.straightness_x_um)
+            + straight((y - middle_y) / half_y, self.straightness_y_um);
         let screw = self.periodic_um * (std::f64::consts::TAU * x / self.periodic_pitch_mm + 0.7).sin();
         finite_or_zero(setting + tilt + straightness + screw)
     }

@@ -12,14 +12,12 @@ use data_encoding::HEXLOWER;
 use regrind::config::{CellConfig, DialectFile, read_dialect};
 use regrind::document::{Problem, Problems};
 use regrind::recipe::{MeasuringPattern, NominalSource, Recipe};
-use regrind::setup::{nominal_table_format, plan_table_format};
+use regrind::setup::{nominal_table_format, plan_table_format, read_nominal};
 use regrind::surface::PlaneProjection;
-use regrind_sim::spec::WorldSpec;
 use serde::Serialize;
 
-use super::Outcome;
 use super::failure::Failure;
-use super::nominal;
+use super::{Outcome, nominal, truth};
 
 /// Check recipes, cell files and dialects: every problem with line, column and remedy
 #[derive(Args, Debug)]
@@ -167,18 +165,16 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
     problems.map_or(Ok(()), Err)
 }
 
-/// Checks the table `[simulation]` of `recipe`, which describes the simulated part and machines, with the same limits
-/// as the simulator. Returns the first problem as an error. Returns `Ok` if there is no such table.
+/// Checks the table `[simulation]` of `recipe`, which describes the simulated part and machines: with the limits of the
+/// simulator, and against the nominal surface. Returns the first problem as an error. Returns `Ok` if there is no such
+/// table.
 fn check_simulation(recipe: &Recipe) -> Result<(), Problems> {
-    let Some(table) = recipe.simulation.clone() else { return Ok(()) };
-    let remedy = "correct the value, or remove the key: every key has a default";
-    let world: WorldSpec = toml::Value::Table(table)
-        .try_into()
-        .map_err(|error: toml::de::Error| recipe.problem("simulation", error.message().trim(), "", remedy))?;
-    world.check().map_err(|error| {
-        let (key, allowed) = (format!("simulation.{}", error.key), format!("allowed is {}", error.limit));
-        recipe.problem(&key, &format!("is {}", error.value), &allowed, remedy)
-    })
+    if recipe.simulation.is_none() {
+        return Ok(());
+    }
+    let nominal = read_nominal(recipe)
+        .map_err(|failure| recipe.problem("nominal", &format!("cannot be used: {failure}"), "", ""))?;
+    truth::world_spec(recipe, &nominal, None).map(drop)
 }
 
 /// Returns the value of `read`. If it is an error, prints all problems of the file with their positions, and returns

@@ -5,11 +5,11 @@ use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
+use regrind::config;
 use regrind::formats::{ResultFolder, write_atomic};
-use regrind::{config, recipe};
 
-use super::Outcome;
 use super::failure::Failure;
+use super::{Outcome, schema};
 
 /// Create a folder to start with: a recipe, a cell, their schemas for the editor, and a page of commands
 #[derive(Args, Clone, Debug)]
@@ -178,7 +178,7 @@ fn make(folder: &Path, machines: Machines, recipe: String, name: &str) -> Result
         ("recipe.toml", recipe),
         ("cell.toml", cell_of(machines.cell())),
         ("README.md", readme(name, machines)),
-        ("recipe.schema.json", format!("{:#}\n", recipe::json_schema())),
+        ("recipe.schema.json", format!("{:#}\n", schema::recipe_schema())),
         ("cell.schema.json", format!("{:#}\n", config::json_schema())),
     ];
     if let Some((there, _)) = files.iter().find(|(file, _)| folder.join(file).exists()) {

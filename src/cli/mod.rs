@@ -38,6 +38,7 @@ mod simulated;
 mod states;
 mod succession;
 mod terminal;
+mod truth;
 mod users;
 mod watch;
 #[cfg(not(feature = "plant"))]

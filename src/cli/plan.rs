@@ -7,10 +7,10 @@ use data_encoding::HEXLOWER;
 use regrind::cell::{CellPlan, FirstStep};
 use regrind::compensation::path::{ArcSummary, PathSummary, Peak, Scallops, ToolPath};
 use regrind::config::{BUILT_IN_CELL, CellConfig};
-use regrind::drive::Task;
+use regrind::drive::{Task, foretell_refusal};
 use regrind::formats::gcode::GcodeError;
 use regrind::model::FIRST_BATCH;
-use regrind::recipe::Recipe;
+use regrind::recipe::{NominalSource, Recipe};
 use regrind::setup::{self, MAX_SCALLOP_SHARE};
 use serde::Serialize;
 
@@ -43,6 +43,10 @@ pub(super) struct Arguments {
 
 /// Duration of a shift in minutes. No pass and no measurement is meant to take longer.
 const MAX_MINUTES: f64 = 480.0;
+/// Form error of a part that a correction is computed for, in limits of the part.
+const FORM_ERROR_LIMITS: f64 = 4.0;
+/// Peak to valley of a form error, in units of its root mean square.
+const PV_OF_RMS: f64 = 6.0;
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let recipe = or_show(Recipe::read(&arguments.recipe))?;
@@ -320,6 +324,8 @@ impl Document {
             warnings: warnings(task, path_mm, grinding_minutes, min_measuring_minutes)
                 .into_iter()
                 .chain(warning_of_scallops(task, recipe))
+                .chain(warning_of_unit(task, recipe))
+                .chain(warning_of_refusal(task, recipe))
                 .collect(),
             program_points: program.map(|(_, summary)| summary.points),
             arcs,
@@ -407,6 +413,41 @@ fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
             setup::track_for_tolerance_mm(recipe, &scallops),
         )
     })
+}
+
+/// Returns a warning if the points of a nominal file enclose a part that is smaller than the wheel or hardly larger than
+/// the ball of the probe. The file is then probably in another unit, such as inches.
+fn warning_of_unit(task: &Task, recipe: &Recipe) -> Option<String> {
+    let NominalSource::File { path, .. } = &recipe.nominal else { return None };
+    let [width_mm, depth_mm] = [task.pass.x_mm, task.pass.y_mm].map(|[low, high]| high - low);
+    let size_mm = width_mm.max(depth_mm);
+    let (wheel_mm, ball_mm) = (task.pass.wheel_radius_mm, 2.0 * task.probing.probe_radius_mm);
+    let n = three_digits;
+    (size_mm < wheel_mm.max(2.0 * ball_mm)).then(|| {
+        format!(
+            "the part is {} mm x {} mm large, but the wheel has a radius of {} mm and the ball of the probe a diameter of {} mm; check that {} is in mm, or \
+             write its unit (nominal.unit = \"inch\")",
+            n(width_mm),
+            n(depth_mm),
+            n(wheel_mm),
+            n(ball_mm),
+            path.display(),
+        )
+    })
+}
+
+/// Returns a warning if a measurement of this part would end without a correction, because the shape of the part does
+/// not determine its position well enough. The measurement is computed for a form error of [`FORM_ERROR_LIMITS`] times
+/// the limits of the part, as a first pass leaves it.
+fn warning_of_refusal(task: &Task, recipe: &Recipe) -> Option<String> {
+    let [pv_mm, rms_mm] =
+        [recipe.acceptance.pv_um.map(|um| um.mm() / PV_OF_RMS), recipe.acceptance.rms_um.map(|um| um.mm())];
+    let rms_mm = FORM_ERROR_LIMITS * rms_mm.into_iter().chain(pv_mm).fold(f64::INFINITY, f64::min);
+    let reason = (rms_mm.is_finite() && !task.targets.is_empty()).then(|| foretell_refusal(task, rms_mm))??;
+    Some(format!(
+        "a measurement of a part with {} µm rms of form error may end without a correction: {reason}",
+        three_digits(1e3 * rms_mm)
+    ))
 }
 
 /// Returns the estimated duration of the planned run as text for a person. The text states the grinding time of each

@@ -20,7 +20,7 @@ use regrind::setup;
 use super::failure::Failure;
 use super::live::{PreparedRun, RunContext, outcome};
 use super::succession::RunPlace;
-use super::{Outcome, check, key, outside, plan, plant, serve, simulated};
+use super::{Outcome, check, key, outside, plan, plant, serve, simulated, truth};
 
 /// Run correction cycles from a recipe until the part is accepted
 #[derive(Args, Debug)]
@@ -103,7 +103,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         plan::first_path(&task, &recipe, &cell)?;
     }
     let spec = match within(&cell) {
-        true => Some(simulated::world_spec(&recipe, arguments.seed)?),
+        true => Some(check::or_show(truth::world_spec(&recipe, &task.nominal, arguments.seed))?),
         false => None,
     };
     super::runtime()?.block_on(async {

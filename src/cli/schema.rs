@@ -1,8 +1,13 @@
 //! `regrind schema`: the JSON schemas of recipes, cell files and dialects, for editors.
 
+use std::sync::LazyLock;
+
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use regrind::document::schema_of;
 use regrind::{config, recipe};
+use regrind_sim::spec::WorldSpec;
+use serde_json::Value;
 
 use super::Outcome;
 use super::failure::Failure;
@@ -23,10 +28,26 @@ pub(super) struct Arguments {
 }
 
 const KINDS: [FileKind; 3] = [
-    ("recipe", "Recipes", recipe::json_schema),
+    ("recipe", "Recipes", recipe_schema),
     ("cell", "Cell files", config::json_schema),
     ("dialect", "Dialects of programs", config::dialect_schema),
 ];
+
+/// Returns the JSON schema of a recipe, with the keys of its table `[simulation]`. The simulator declares these keys.
+pub(super) fn recipe_schema() -> &'static Value {
+    static SCHEMA: LazyLock<Value> = LazyLock::new(|| {
+        let mut schema = recipe::json_schema().clone();
+        let mut simulation = schema_of::<WorldSpec>();
+        let about = &mut schema["properties"]["simulation"];
+        simulation["description"] = about["description"].take();
+        if let Some(simulation) = simulation.as_object_mut() {
+            simulation.remove("$schema");
+        }
+        *about = simulation;
+        schema
+    });
+    &SCHEMA
+}
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let (_, _, schema) = arguments.of;

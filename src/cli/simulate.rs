@@ -5,12 +5,13 @@ use std::path::PathBuf;
 use clap::Args;
 use regrind::config::CellConfig;
 use regrind::recipe::Recipe;
+use regrind::setup;
 use regrind_sim::body::Kind;
 use serde_json::json;
 
 use super::check::or_show;
 use super::failure::Failure;
-use super::{Outcome, simulated};
+use super::{Outcome, simulated, truth};
 
 /// Serve the simulated CMM and grinder of a cell on their wires until stopped
 #[derive(Args, Debug)]
@@ -44,7 +45,8 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let recipe = or_show(Recipe::read(&arguments.recipe))?;
     let mut cell = or_show(CellConfig::read(&arguments.cell))?;
-    let spec = simulated::world_spec(&recipe, arguments.seed)?;
+    let nominal = setup::read_nominal(&recipe).map_err(Failure::Setup)?;
+    let spec = or_show(truth::world_spec(&recipe, &nominal, arguments.seed))?;
     super::runtime()?.block_on(async {
         let serving = simulated::serve(spec, &mut cell, &recipe).await?;
         arguments.log.as_deref().map_or(Ok(()), |log| serving.log_to(log))?;

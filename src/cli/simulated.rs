@@ -17,7 +17,7 @@ use regrind_sim::simulated_cell::{MachineTable, RequiredWheel, ServedLine, Serve
 use regrind_sim::simulators;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::failure::Failure;
 
@@ -36,27 +36,6 @@ struct Witnessed<'a> {
     unit: u8,
     #[serde(flatten)]
     seen: &'a LogEntry,
-}
-
-/// Reads the properties of the simulated part and machines, such as the true shape of the part, from the table
-/// `[simulation]` of `recipe`. If `seed` is given, it replaces the seed of the random numbers in this table.
-///
-/// # Errors
-/// Returns an error if the recipe has no table `[simulation]`, or an invalid one.
-pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec, Failure> {
-    let none = || {
-        Failure::Simulation {
-        path: recipe.path().to_owned(),
-        reason: "the recipe has no table [simulation], which defines the true shape of the simulated part; add this table, or use a cell of real machines".into(),
-    }
-    };
-    let table = recipe.simulation.clone().ok_or_else(none)?;
-    let failed = |reason: String| Failure::Simulation { path: recipe.path().to_owned(), reason };
-    let mut spec =
-        WorldSpec::deserialize(toml::Value::Table(table)).map_err(|e| failed(format!("[simulation]: {e}")))?;
-    spec.seed = seed.unwrap_or(spec.seed);
-    spec.check().map_err(|e| failed(format!("[simulation]: {e}")))?;
-    Ok(spec)
 }
 
 /// Starts servers for the simulated machines of the cell `cell`, at the addresses in the cell file. `spec` defines the

@@ -29,8 +29,8 @@ pub use grinding::{MAX_SCALLOP_SHARE, track_for_tolerance_mm};
 use grinding::{pass, programs, surface_and_outline, track_distance};
 use learning::{learning_kind, learning_setting};
 use measurement::{adaptive, expansion, lay_targets, min_found_share, probing, reference_sphere};
-use nominal::read_nominal;
-pub use nominal::{nominal_from_file, nominal_table_format, plan_table_format};
+use nominal::nominal_with_identity;
+pub use nominal::{nominal_from_file, nominal_table_format, plan_table_format, read_nominal};
 
 /// Size of one target in the registers of a plan, in bytes. A point of a result is smaller.
 const MAX_TARGET_BYTES: usize = 56;
@@ -42,7 +42,7 @@ const MAX_TARGET_BYTES: usize = 56;
 /// Returns an error if the nominal surface or the measuring pattern cannot be read or computed, or if the recipe and
 /// the cell do not fit together, for example because a value of the recipe exceeds a limit of the cell.
 pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), SetupError> {
-    let (nominal, nominal_file, part_identity) = read_nominal(recipe)?;
+    let (nominal, nominal_file, part_identity) = nominal_with_identity(recipe)?;
     let side = recipe.measure.side.side().unwrap_or_default();
     let targets = lay_targets(recipe, &nominal, side)?;
     check_limits(recipe, cell, &targets)?;

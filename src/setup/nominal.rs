@@ -9,9 +9,17 @@ use crate::formats::{self, NominalFile};
 use crate::recipe::{NominalSource, Recipe, TableSettings};
 use crate::surface::{DefinedSurface, Nominal, PlaneProjection};
 
+/// Reads the nominal surface that `recipe` names from a file, or samples it from the formula in `recipe`.
+///
+/// # Errors
+/// Returns an error if the file cannot be read, or if no surface can be built from the file or the formula.
+pub fn read_nominal(recipe: &Recipe) -> Result<Nominal, SetupError> {
+    nominal_with_identity(recipe).map(|(nominal, ..)| nominal)
+}
+
 /// Reads the nominal surface from a file, or samples it from a formula. Returns the surface, the path of its source
 /// (the file or the recipe), and the SHA-256 that identifies the part.
-pub(super) fn read_nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> {
+pub(super) fn nominal_with_identity(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> {
     match &recipe.nominal {
         NominalSource::Surface(surface) => {
             let nominal = sample_surface(recipe.path(), surface)?;

@@ -390,15 +390,32 @@ fn commands_refuse_broken_files() {
 }
 
 #[test]
-fn recipe_without_simulation_refused() {
+fn recipe_without_simulation_uses_nominal() {
     let home = tempfile::tempdir().unwrap();
     let text = fs::read_to_string(recipe(home.path(), 1e4)).unwrap();
     let cut = text.split("# The truth of a simulated cell").next().unwrap();
     fs::write(home.path().join("real.toml"), cut).unwrap();
-    for command in ["run", "simulate"] {
-        let (code, _, errors) = in_time(&[command, "real.toml", "--cell", &sim_cell()], home.path());
-        assert_eq!(code, 2, "{errors}");
-        assert!(errors.contains("[simulation]"), "{errors}");
+    let (code, shown, errors) = in_time(&["run", "real.toml", "--cell", &sim_cell(), "--runs", "runs"], home.path());
+    assert_eq!(code, 0, "{shown}{errors}");
+}
+
+/// A truth of another part is refused before anything moves, with its place.
+#[test]
+fn truth_of_other_part_refused() {
+    let home = tempfile::tempdir().unwrap();
+    let text = fs::read_to_string(recipe(home.path(), 1e4)).unwrap();
+    let cases = [
+        ("value_mm = 10.5", "value_mm = 10.4", "simulation.part.shape"),
+        ("half_x_mm = 51.0", "half_x_mm = 40.0", "simulation.part.aperture"),
+    ];
+    for (is, other, key) in cases {
+        assert!(text.contains(is), "{is}");
+        fs::write(home.path().join("other.toml"), text.replace(is, other)).unwrap();
+        for command in [&["check", "other.toml"][..], &["run", "other.toml", "--cell", &sim_cell()]] {
+            let (code, _, errors) = in_time(command, home.path());
+            assert_eq!(code, 2, "{errors}");
+            assert!(errors.contains(key) && errors.contains("other.toml:"), "{errors}");
+        }
     }
 }
 

@@ -6,7 +6,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use nalgebra::{DMatrix, DVector};
 use rand::RngExt;
-use regrind_sim::part::{Aperture, DefectSpec, PartSpec};
+use regrind_sim::aperture::Aperture;
+use regrind_sim::part::{DefectSpec, PartSpec};
 use regrind_testutils::sample::{all, seeds};
 
 use crate::worlds::{Ran, Setup, Snapshot, run, table};
@@ -54,11 +55,11 @@ impl Case {
         let mut along = |half: f64| 0.8 * half * (2.0 * rng.random::<f64>() - 1.0);
         let anywhere = match part.aperture {
             Aperture::Rectangle { .. } => [along(half_x), along(half_y)],
-            Aperture::Circle { .. } => [along(0.7 * half_x), along(0.7 * half_y)],
+            _ => [along(0.7 * half_x), along(0.7 * half_y)],
         };
         let corner = match part.aperture {
             Aperture::Rectangle { .. } => [half_x - 2.0, half_y - 2.0],
-            Aperture::Circle { radius_mm } => [0.7 * radius_mm, 0.7 * radius_mm],
+            _ => [0.7 * half_x, 0.7 * half_y],
         };
         let (at_mm, size_mm, sign, round) = match self.kind {
             Kind::Chip => (anywhere, [3.0, 3.0], -1.0, false),

@@ -8,7 +8,6 @@ use std::process::{Command, Stdio};
 use regrind::recipe::Recipe;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
-use serde::Deserialize as _;
 
 use crate::first_touches::{file_cell, hand_in, measured, open_plan};
 use crate::program::{Running, only_run, regrind, replaced, root, run, small_recipe};
@@ -89,7 +88,7 @@ fn wrong_result_file_uses_no_cycle() {
     fs::write(&recipe, replaced(&text, "qualify = true", "qualify = false")).unwrap();
     file_cell(home);
     let table = Recipe::read(&recipe).unwrap().simulation.unwrap();
-    let world = World::new(WorldSpec::deserialize(toml::Value::Table(table)).unwrap()).unwrap();
+    let world = World::new(table.try_into::<WorldSpec>().unwrap()).unwrap();
     let mut running = Running::new(regrind(&["run", "small.toml", "--cell", "cell.toml", "--loaded", "--json"], home));
 
     // The plan's own positions instead of the measured ones, a truncated file, and rows in another order.

@@ -11,7 +11,6 @@ use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
 use regrind_testcell::outlived::on_serial_lines;
 use regrind_testcell::study::touch;
-use serde::Deserialize as _;
 use serde_json::Value;
 
 /// Fault, the replacement in the recipe's world that causes it, and the alarm that reports it.
@@ -27,7 +26,14 @@ const WRONG: [(&str, [&str; 2], &str); 4] = [
         ["[simulation.part]", "[simulation.cmm]\nprobe_radius_error_um = 50.0\n\n[simulation.part]"],
         "probe_radius",
     ),
-    ("wrong part", ["i = 3, j = 0, value_mm = 2.6", "i = 3, j = 0, value_mm = 3.4"], "registration_failed"),
+    (
+        "wrong part",
+        [
+            "j = 4, value_mm = 1.2 },\n]",
+            "j = 4, value_mm = 1.2 },\n{ i = 3, j = 0, value_mm = 0.8 }]\n\n[simulation.faults]\nwrong_shape = true",
+        ],
+        "registration_failed",
+    ),
 ];
 
 /// Returns the free-form recipe with chosen touches, for a part that is measured first, in a world with this
@@ -84,7 +90,7 @@ fn faults_found_by_file_exchange() {
         fs::write(home.path().join("part.toml"), &text).unwrap();
         file_cell(home.path());
         let table = Recipe::read(&home.path().join("part.toml")).unwrap().simulation.unwrap();
-        let world = World::new(WorldSpec::deserialize(toml::Value::Table(table)).unwrap()).unwrap();
+        let world = World::new(table.try_into::<WorldSpec>().unwrap()).unwrap();
         let mut running =
             Running::new(regrind(&["run", "part.toml", "--cell", "cell.toml", "--loaded", "--json"], home.path()));
         let folder = begun_run(home.path(), &mut running);

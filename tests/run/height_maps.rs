@@ -28,7 +28,6 @@ use regrind_sim::shape::{FreeForm, Shape};
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::Serving;
 use regrind_sim::world::World;
-use serde::Deserialize;
 use serde_json::Value;
 use tokio::sync::mpsc;
 
@@ -207,7 +206,7 @@ async fn run(seed: u64) -> Ran {
     let (shop, folder) = (home.path().join("shop"), home.path().join("run"));
     ["in", "out"].iter().for_each(|name| fs::create_dir_all(shop.join(name)).unwrap());
     let recipe = recipe();
-    let mut spec = WorldSpec::deserialize(toml::Value::Table(recipe.simulation.clone().unwrap())).unwrap();
+    let mut spec = recipe.simulation.clone().unwrap().try_into::<WorldSpec>().unwrap();
     (spec.seed, spec.speed) = (seed, SPEED);
     (spec.cmm.translation_mm, spec.cmm.rotation_deg) = ([0.8, -1.1, 3.0], [0.7, -0.5, 1.2]);
     let world = World::new(spec).unwrap();

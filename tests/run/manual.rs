@@ -12,7 +12,6 @@ use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
 use regrind_testcell::http::Visitor;
 use regrind_testcell::study::{grind, touch};
-use serde::Deserialize;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
@@ -38,7 +37,7 @@ fn recipe(home: &Path) -> (PathBuf, WorldSpec) {
     fs::write(&path, &text).unwrap();
     let table: toml::Table = toml::from_str(&text).unwrap();
     assert_eq!(table["measure"]["probe_radius_mm"].as_float(), Some(RADIUS_MM));
-    (path, WorldSpec::deserialize(table["simulation"].clone()).unwrap())
+    (path, table["simulation"].clone().try_into::<WorldSpec>().unwrap())
 }
 
 /// Returns the rows of numbers below the comments and the header of a file.

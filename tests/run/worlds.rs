@@ -27,7 +27,6 @@ use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::Serving;
 use regrind_sim::world::World;
-use serde::Deserialize;
 use serde_json::json;
 use tokio::sync::mpsc;
 
@@ -385,7 +384,7 @@ pub fn header(part: &str) -> Header {
 
 fn world(setup: &Setup, recipe: &Recipe) -> World {
     let table = recipe.simulation.clone().expect("the recipe has a world");
-    let mut spec = WorldSpec::deserialize(toml::Value::Table(table)).unwrap();
+    let mut spec = table.try_into::<WorldSpec>().unwrap();
     spec.seed = setup.seed;
     spec.speed = SPEED;
     (setup.world)(&mut spec);

@@ -17,7 +17,6 @@ use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::SharedMachine;
 use regrind_sim::wire::lines::SharedLineServer;
 use regrind_sim::world::World;
-use serde::Deserialize;
 use tokio::time::Instant;
 
 use crate::cue::Cues;
@@ -118,7 +117,7 @@ impl Machines {
     pub fn new(schedule: &Schedule, cues: &Cues) -> Self {
         let Schedule { seed, speed, trusting, .. } = *schedule;
         let truth = setting(RequiredQuality::Good).recipe.simulation.clone().unwrap();
-        let mut spec = WorldSpec::deserialize(toml::Value::Table(truth)).unwrap();
+        let mut spec = truth.try_into::<WorldSpec>().unwrap();
         spec.seed = 1 + seed % 7;
         if schedule.dme.is_some() {
             spec.cmm.not_found_share = 0.01;

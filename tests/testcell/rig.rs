@@ -17,7 +17,6 @@ use regrind_sim::registers::SimulatedMachine;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
 use regrind_testutils::root;
-use serde::Deserialize;
 use serde_json::json;
 use tempfile::TempDir;
 use tokio::sync::mpsc;
@@ -112,7 +111,7 @@ impl Drop for Rig {
 impl Rig {
     /// Creates the world of a recipe and serves its machines on free ports.
     pub async fn new(recipe: Recipe) -> Self {
-        let spec = WorldSpec::deserialize(toml::Value::Table(recipe.simulation.clone().unwrap())).unwrap();
+        let spec = recipe.simulation.clone().unwrap().try_into::<WorldSpec>().unwrap();
         let speed = spec.speed;
         let world = World::new(spec).unwrap();
         let options = |seed| MachineOptions { speed, seed, ..MachineOptions::default() };

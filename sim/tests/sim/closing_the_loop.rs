@@ -2,7 +2,7 @@
 
 use crate::common::{best_fit, grind, map_of, net, pass, pv_rms_um};
 use rand_distr::{Distribution, StandardNormal};
-use regrind_sim::part::Aperture;
+use regrind_sim::aperture::Aperture;
 use regrind_sim::payload::{Map, Pass};
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
@@ -24,10 +24,10 @@ fn low_passed(places_mm: &[[f64; 2]], values_mm: &[f64], x: f64, y: f64) -> f64 
 }
 
 /// Where a client would measure: a net of 1.75 mm that stays half a millimetre within the edge.
-fn places(aperture: Aperture) -> Vec<[f64; 2]> {
+fn places(aperture: &Aperture) -> Vec<[f64; 2]> {
     let within = aperture.half_mm().map(|half| half - 0.5);
     let mut places = net(within, 1.75);
-    if let Aperture::Circle { radius_mm } = aperture {
+    if let Aperture::Circle { radius_mm, .. } = aperture {
         places.retain(|[x, y]| x.hypot(*y) <= radius_mm - 0.5);
     }
     places
@@ -36,7 +36,7 @@ fn places(aperture: Aperture) -> Vec<[f64; 2]> {
 /// Returns PV and RMS in micrometres of so many cycles, as a CMM with 0.3 um of noise would see them.
 fn cycles(spec: WorldSpec, count: u16) -> Vec<(f64, f64)> {
     let (seed, half_mm) = (spec.seed, spec.part.aperture.half_mm());
-    let places = places(spec.part.aperture);
+    let places = places(&spec.part.aperture);
     let world = World::new(spec).unwrap();
     let mut grinder = world.grinder();
     let mut rng = regrind_sim::rng(seed + 1000);

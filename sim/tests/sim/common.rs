@@ -1,9 +1,10 @@
 //! A client in a few lines: payloads, whole jobs, and what is left of a deviation when the part may be moved.
 #![allow(dead_code)]
 
+use regrind_sim::aperture::Aperture;
 use regrind_sim::body::{Payload, Payloads, Physics, ResultData};
 use regrind_sim::grinder::Grinder;
-use regrind_sim::part::{Aperture, PartSpec, ShapeSpec};
+use regrind_sim::part::{PartSpec, ShapeSpec};
 use regrind_sim::payload::{Feature, Map, Pass, PassRecord, Plan, PointRecord, Target};
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
@@ -18,7 +19,7 @@ pub fn small_perfect() -> WorldSpec {
     WorldSpec {
         part: PartSpec {
             shape: ShapeSpec::Sphere { radius_mm: 60.0 },
-            aperture: Aperture::Rectangle { half_x_mm: 15.0, half_y_mm: 10.0 },
+            aperture: Aperture::rectangle(15.0, 10.0),
             form_error_um: 0.0,
             ..PartSpec::default()
         },

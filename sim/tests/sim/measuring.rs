@@ -2,8 +2,9 @@
 
 use crate::common::{cmm_payloads, measure, net, plan, run, small_perfect};
 use regrind_sim::Vec3;
+use regrind_sim::aperture::Aperture;
 use regrind_sim::body::Physics;
-use regrind_sim::part::{Aperture, PartSpec, ShapeSpec};
+use regrind_sim::part::{PartSpec, ShapeSpec};
 use regrind_sim::payload::{Feature, Plan, Status, Target};
 use regrind_sim::spec::CmmSpec;
 use regrind_sim::spec::{WorldFaults, WorldSpec};
@@ -260,7 +261,7 @@ fn world_spec_round_trip_all_shapes() {
     "#;
     let spec: WorldSpec = toml::from_str(table).unwrap();
     assert_eq!((spec.seed, spec.cmm.noise_um, spec.part.stock_um), (4, 0.1, 200.0));
-    assert_eq!(spec.part.aperture, Aperture::Circle { radius_mm: 20.0 });
+    assert_eq!(spec.part.aperture, Aperture::circle(20.0));
     assert_eq!(toml::from_str::<WorldSpec>(&toml::to_string(&spec).unwrap()).unwrap(), spec);
     assert!(toml::from_str::<WorldSpec>("[cmm]\nnoise = 1").is_err());
     assert!(toml::from_str::<WorldSpec>("[part]\nshape = { kind = \"sphere\", radius_mm = 5, r = 1 }").is_err());
@@ -273,8 +274,7 @@ fn world_spec_round_trip_all_shapes() {
         ShapeSpec::Wave { height_mm: 0.01 },
     ];
     for shape in shapes {
-        let part =
-            PartSpec { shape: shape.clone(), aperture: Aperture::Circle { radius_mm: 20.0 }, ..PartSpec::default() };
+        let part = PartSpec { shape: shape.clone(), aperture: Aperture::circle(20.0), ..PartSpec::default() };
         let world = world(WorldSpec { part, ..WorldSpec::default() });
         let (_, records) = measure(&mut world.cmm(), &plan(&world, &net([12.0, 12.0], 3.0)));
         assert!(records.iter().all(|r| r.status == Status::Touched), "{shape:?}");
@@ -293,7 +293,7 @@ fn world_spec_error_names_key() {
     assert_eq!(bad(&|s| s.part.stock_um = -1.0), "part.stock_um");
     assert_eq!(bad(&|s| s.part.shape = ShapeSpec::Sphere { radius_mm: 40.0 }), "part.shape");
     assert_eq!(bad(&|s| s.part.shape = ShapeSpec::Sphere { radius_mm: 0.0 }), "part.shape");
-    assert_eq!(bad(&|s| s.part.aperture = Aperture::Circle { radius_mm: 1e9 }), "part.aperture");
+    assert_eq!(bad(&|s| s.part.aperture = Aperture::circle(1e9)), "part.aperture");
     assert_eq!(bad(&|s| s.grinder.error_copying = 1.0), "grinder.error_copying");
     assert_eq!(bad(&|s| s.grinder.thermal_tau_s = 0.0), "grinder.thermal_tau_s");
     assert_eq!(bad(&|s| s.cmm.not_found_share = 1.1), "cmm.not_found_share");

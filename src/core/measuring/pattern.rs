@@ -50,9 +50,10 @@ pub enum PatternError {
     TooMany { count: f64 },
     #[error(
         "none of the {requested} places of the measuring pattern lies on the part at least {margin_mm} mm inside its \
-         edge; reduce edge_margin_mm or the spacing"
+         edge; the part is {:.3} mm x {:.3} mm large: correct the unit of the nominal surface if it is not that large, or \
+         reduce edge_margin_mm or the spacing", size_mm[0], size_mm[1]
     )]
-    NoneOnPart { requested: usize, margin_mm: f64 },
+    NoneOnPart { requested: usize, margin_mm: f64, size_mm: [f64; 2] },
 }
 
 /// Returns the targets of a measuring pattern on the part, in the order of measurement. A target is a point of the
@@ -77,7 +78,8 @@ pub fn targets(nominal: &Nominal, side: Side, layout: &Layout, margin_mm: f64) -
         found.extend(target.filter(|target| walk.is_inside(target, margin_mm)));
     }
     if found.is_empty() {
-        return Err(PatternError::NoneOnPart { requested: places.len(), margin_mm });
+        let size_mm = [0, 1].map(|k| bounds[1][k] - bounds[0][k]);
+        return Err(PatternError::NoneOnPart { requested: places.len(), margin_mm, size_mm });
     }
     Ok(found)
 }

@@ -4,6 +4,8 @@
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::fs;
+use std::path::Path;
+use std::sync::LazyLock;
 
 use regrind::cell::{AlarmId, Role};
 use serde_json::Value;
@@ -15,8 +17,14 @@ const BEGINS: &str = "<!-- made: ";
 const ENDS: &str = "<!-- end -->";
 
 fn schema(kind: &str) -> &'static Value {
+    // The program adds the keys of the simulator.
+    static RECIPE: LazyLock<Value> = LazyLock::new(|| {
+        let (code, out, err) = crate::program::run(&["schema", "recipe"], Path::new("."));
+        assert_eq!(code, 0, "{err}");
+        serde_json::from_str(&out).unwrap()
+    });
     match kind {
-        "recipe" => regrind::recipe::json_schema(),
+        "recipe" => &RECIPE,
         "cell" => regrind::config::json_schema(),
         "dialect" => regrind::config::dialect_schema(),
         _ => panic!("no schema of a {kind}"),

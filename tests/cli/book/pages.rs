@@ -82,6 +82,10 @@ fn whole(fragment: &str, home: &Path) -> PathBuf {
         _ => "recipes/freeform-mirror.toml",
     });
     let mut file: toml::Table = fs::read_to_string(&shipped).unwrap().parse().unwrap();
+    if tables.contains_key("nominal") {
+        // The truth of the shipped part is not that of another one.
+        file.remove("simulation");
+    }
     put(&mut file, tables);
     let path = shipped.with_file_name("fragment.toml");
     fs::write(&path, toml::to_string(&file).unwrap()).unwrap();
@@ -145,6 +149,7 @@ macro_rules! typed {
 typed! {
     the_introduction_is_typed: "introduction.md"
     the_first_part_is_made: "first-part.md"
+    own_part_is_made: "own-part.md"
     recipes_are_written: "recipes.md"
     a_cell_is_commissioned: "commissioning.md"
     a_person_serves_the_machines: "manual.md"
