@@ -111,7 +111,7 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
         if let Some(what) = &begun.lost {
             let remark = format!("resumed with --despite-loss, although the end of the record may be lost: {what}");
             let Actor { name, station } = live.actor.clone();
-            let remark = Content::Remark(Remark { remark });
+            let remark = Content::Remark(Remark { remark, alarm: None });
             journal.append(remark.entry(0, begun.cycle, (name, station))).map_err(Failure::Journal)?;
         }
         let (loaded, interrupted) = (cell.simulated, Some(interrupted));

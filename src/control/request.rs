@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use regrind_cell::Device;
+use regrind_cell::{AlarmId, Device};
 use regrind_document::misleading;
 use serde::{Deserialize, Serialize};
 
@@ -69,9 +69,15 @@ pub enum Request {
         #[serde(default)]
         device: Option<Device>,
     },
-    /// Remark for the record from a program that gives orders for people, such as the server of the web page: who took
-    /// control, or what was refused.
-    Remark { what: String },
+    /// Remark for the record: an entry of a person in the log of the shift, or a note of a program that gives orders for
+    /// people, such as the server of the web page. With `alarm`, the person acknowledges this active alarm: somebody has
+    /// seen it and takes care. This clears nothing.
+    Remark {
+        #[serde(default)]
+        what: String,
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        alarm: Option<AlarmId>,
+    },
     /// Request for the preliminary touches of the present measurement, from the point with the index `from` on. The
     /// index counts the points of the part in the order of the measurement.
     Touches {
@@ -162,7 +168,7 @@ impl RequestLine {
             | Request::Stop { reason }
             | Request::Abort { reason } => Some(reason),
             Request::Over { evidence, .. } => Some(evidence),
-            Request::Remark { what } => Some(what),
+            Request::Remark { what, .. } => Some(what),
             _ => None,
         };
         let by = self.on_behalf.iter().flat_map(|by| by.name.iter().chain([&by.station]));

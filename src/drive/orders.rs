@@ -6,7 +6,7 @@ use tokio::sync::oneshot;
 
 use super::Drive;
 use super::record_queue::RecordAction;
-use crate::cell::{Actor, Device, Event, Phase};
+use crate::cell::{Actor, AlarmId, Device, Event, Phase};
 use crate::device::{Identified, OperatorConfirmation};
 use crate::record::{Confirmation, Content, Remark};
 
@@ -36,7 +36,7 @@ impl Drive {
             Request::Started { .. } | Request::Done { .. } | Request::Still { .. } => {
                 return self.handle_confirmation(&request, &actor, answer);
             }
-            Request::Remark { what } => return self.record_remark(&what, &actor, answer),
+            Request::Remark { what, alarm } => return self.record_remark((what, alarm), &actor, answer),
             Request::Clear { device } => Event::ClearConfirmed { actor, device },
             Request::Hold { reason, .. } => Event::Hold { actor, reason },
             Request::Resume { reason, .. } => Event::Resume { actor, reason },
@@ -62,10 +62,28 @@ impl Drive {
         }
     }
 
-    /// Records the text `what` of a [`Request::Remark`]. Answers the program that sent the request through `answer`,
-    /// after the text is recorded.
-    pub(super) fn record_remark(&mut self, what: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
-        let ticket = self.append(self.now(), origin(actor), &Content::Remark(Remark { remark: what.to_owned() }));
+    /// Records the text and the acknowledged alarm of a [`Request::Remark`]. Answers the program that sent the request
+    /// through `answer`, after the remark is recorded. Refuses a remark without content, and the acknowledgement of an
+    /// alarm that is not active.
+    pub(super) fn record_remark(
+        &mut self,
+        (remark, alarm): (String, Option<AlarmId>),
+        actor: &Actor,
+        answer: Option<oneshot::Sender<Reply>>,
+    ) {
+        let status = self.snapshot();
+        let refusal = match alarm {
+            Some(id) if !status.alarms.iter().any(|active| active.id == id) => Some("this alarm is not active"),
+            None if remark.trim().is_empty() => Some("the entry has no text"),
+            _ => None,
+        };
+        if let Some(refusal) = refusal {
+            if let Some(answer) = answer {
+                drop(answer.send(Reply::new(false, refusal.to_owned(), status)));
+            }
+            return;
+        }
+        let ticket = self.append(self.now(), origin(actor), &Content::Remark(Remark { remark, alarm }));
         if let Some(answer) = answer {
             let then = RecordAction::Answer { answer, accepted: true, message: "recorded".into() };
             self.record.queue(ticket, then);

@@ -5,7 +5,8 @@ use maud::{Markup, html};
 use regrind_cell::Tolerance;
 use regrind_report::CycleSummary;
 
-use super::texts::{Language, Text, decimal};
+use super::language::{Language, decimal};
+use super::texts::Text;
 
 const WIDTH: f64 = 420.0;
 const HEIGHT: f64 = 190.0;

@@ -2,7 +2,8 @@
 
 use maud::{Markup, html};
 
-use super::texts::{Language, Text, decimal};
+use super::language::{Language, decimal};
+use super::texts::Text;
 
 /// Width of the bar in the units of its picture.
 const WIDTH: f64 = 400.0;

@@ -18,11 +18,13 @@ mod gauge;
 mod guard;
 mod guarded_server;
 mod history;
+mod language;
 mod live;
 mod operator_step;
 mod orders;
 mod pieces;
 mod rate;
+mod record_view;
 mod sessions;
 mod shape;
 mod shared;
@@ -117,6 +119,7 @@ fn routes(page: Shared) -> Router {
         .route("/runs/{run}/control", post(orders::take_control))
         .route("/runs/{run}/step-file", get(operator_step::step_file))
         .route("/runs/{run}/report", get(view::report))
+        .route("/runs/{run}/record", get(record_view::record))
         .route("/runs/{run}/planned", get(shape::planned))
         .route("/runs/{run}/touched", get(shape::touched))
         .route("/runs/{run}/cycles/{cycle}/map", get(shape::map))

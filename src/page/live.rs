@@ -2,12 +2,13 @@
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use regrind_cell::StateName;
 use regrind_control::{PreliminaryTouches, Request, Snapshot, send_request, watch};
-use regrind_report::{RunResult, RunSummary};
+use regrind_report::{AlarmHistory, HoldOrder, RunResult, RunSummary};
 use tokio::sync::watch::{Receiver, Sender};
 use tokio::task::{JoinHandle, spawn_blocking};
 
@@ -19,6 +20,9 @@ const BETWEEN_TRIES: Duration = Duration::from_secs(1);
 /// Time for which a run is watched after the last browser has left. A page that is loaded again finds its status, and
 /// the cell is not asked for a new connection each time.
 const LINGERS: Duration = Duration::from_secs(5);
+
+/// Interval between two looks at the record while people may say something that changes no state.
+const READ_AGAIN_AFTER: Duration = Duration::from_millis(500);
 
 /// Current knowledge about a run.
 #[derive(Clone, Default)]
@@ -113,12 +117,32 @@ async fn follow(folder: &Path, history: &Arc<History>, seen: &Sender<ObservedRun
     let mut watch = watch(folder).await?;
     let mut read_at = None;
     let mut reading = None;
-    while let Some(snapshot) = watch.next().await? {
-        // Measurements, judgements and alarms always come with a new state. The reason of a hold does not.
+    let mut may_be_told = false;
+    loop {
+        let next = {
+            let mut next = pin!(watch.next());
+            loop {
+                // The record has what people say only after the state that this belongs to, and with no state of its own.
+                tokio::select! {
+                    next = &mut next => break next?,
+                    () = tokio::time::sleep(READ_AGAIN_AFTER), if may_be_told => {
+                        let summary = read(folder, history).await;
+                        seen.send_if_modified(|now| {
+                            let changed = told_by_people(&now.summary) != told_by_people(&summary);
+                            now.summary = summary;
+                            changed
+                        });
+                    }
+                }
+            }
+        };
+        let Some(snapshot) = next else { return Ok(()) };
+        // Measurements, judgements and alarms always come with a new state. The reason of a hold and the acknowledgement
+        // of an alarm do not.
         let at = (snapshot.state_number, snapshot.cycles.len());
-        let is_held = matches!(snapshot.state, StateName::Holding | StateName::Held);
+        may_be_told = matches!(snapshot.state, StateName::Holding | StateName::Held) || !snapshot.alarms.is_empty();
         let summary = match read_at {
-            Some(before) if before == at && !is_held => Arc::clone(&seen.borrow().summary),
+            Some(before) if before == at && !may_be_told => Arc::clone(&seen.borrow().summary),
             _ => read(folder, history).await,
         };
         read_at = Some(at);
@@ -126,12 +150,17 @@ async fn follow(folder: &Path, history: &Arc<History>, seen: &Sender<ObservedRun
         let touches = newer_touches(folder, known, &snapshot, &mut reading).await;
         let snapshot = Some(Arc::new(snapshot));
         seen.send_if_modified(|now| {
-            let changed = now.snapshot != snapshot || !now.answers || now.summary.hold != summary.hold;
+            let changed =
+                now.snapshot != snapshot || !now.answers || told_by_people(&now.summary) != told_by_people(&summary);
             *now = ObservedRun { snapshot, answers: true, summary, touches };
             changed
         });
     }
-    Ok(())
+}
+
+/// Returns what people have said about the present state: the reason of a hold, and acknowledgements of alarms.
+fn told_by_people(summary: &RunSummary) -> (Option<&HoldOrder>, &[AlarmHistory]) {
+    (summary.hold.as_ref(), &summary.alarms)
 }
 
 /// Task that asks the cell for further touches.

@@ -69,7 +69,19 @@ pub(crate) async fn order(
     {
         return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
     }
-    answered(give(folder, request, &session).await)
+    answered(give(folder, marked(request), &session).await)
+}
+
+/// Returns an entry of a person in the log of the shift with its mark, so that nobody takes it for a note of a program.
+/// Other requests are unchanged.
+fn marked(request: Request) -> Request {
+    match request {
+        Request::Remark { what, alarm: None } if !what.trim().is_empty() => {
+            let entry: String = what.trim().chars().take(MAX_ENTRY_CHARACTERS).collect();
+            Request::Remark { what: format!("shift log: {entry}"), alarm: None }
+        }
+        other => other,
+    }
 }
 
 /// Takes the file of a measurement in `body`, and confirms with it that the measurement is done. The name of the file is
@@ -143,8 +155,11 @@ async fn permitted(page: &Shared, run: &str, session: &Session, name: &str) -> R
     Ok(())
 }
 
+/// Maximum length of an entry in the log of the shift.
+const MAX_ENTRY_CHARACTERS: usize = 400;
+
 /// Orders that every screen can give, without control.
-const MAKES_SAFE: [&str; 3] = ["hold", "stop", "abort"];
+const MAKES_SAFE: [&str; 4] = ["hold", "stop", "abort", "remark"];
 
 /// Returns the name of an order that the page can give, such as `hold`; `None` for any other request to a cell.
 fn name_of(request: &Request) -> Option<&'static str> {
@@ -161,6 +176,7 @@ fn name_of(request: &Request) -> Option<&'static str> {
         Request::Started { .. } => Some("started"),
         Request::Done { file: None, .. } => Some("done"),
         Request::Still { device: Some(_) } => Some("still"),
+        Request::Remark { .. } => Some("remark"),
         _ => None,
     }
 }
@@ -201,7 +217,7 @@ pub(crate) async fn take_control(
     }
     let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
     let what = "another screen of the page took control of the cell".to_owned();
-    let recorded = give(folder, Request::Remark { what }, &session).await;
+    let recorded = give(folder, Request::Remark { what, alarm: None }, &session).await;
     if recorded.is_ok() {
         page.guard.take_control(&session);
     }
@@ -238,7 +254,7 @@ pub(crate) fn write_down(history: &Arc<History>, run: Option<String>, what: Stri
         let folders = run.map_or_else(|| history.live(), |run| history.folder(&run).into_iter().collect());
         for folder in folders {
             let by = OnBehalf { name: None, station: "page".into() };
-            drop(send_request_on_behalf(&folder, &Request::Remark { what: what.clone() }, Some(by)));
+            drop(send_request_on_behalf(&folder, &Request::Remark { what: what.clone(), alarm: None }, Some(by)));
         }
     })
 }

@@ -4,14 +4,15 @@
 use maud::{Markup, html};
 use regrind_cell::{Alarm, Device, Phase, Role, StateName, Tolerance};
 use regrind_control::{JobProgress, NextStep, PreviewStatistics, Snapshot};
-use regrind_report::{AlarmHistory, CycleSummary, RunResult, RunSummary};
+use regrind_report::{AlarmAcknowledgement, AlarmHistory, CycleSummary, RunResult, RunSummary};
 
 use super::alarms::alarm_texts;
 use super::chart::chart;
 use super::gauge::gauge;
+use super::language::{Language, decimal};
 use super::live::ObservedRun;
 use super::operator_step;
-use super::texts::{self, Language, Text, decimal};
+use super::texts::{self, Text};
 
 /// Piece of the page of a run, which is updated on its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -352,15 +353,15 @@ fn alarms(seen: &ObservedRun, language: Language) -> Markup {
     if let Some(live) = seen.snapshot.as_deref().filter(|live| seen.answers && !is_over(live.state)) {
         return html! {
             @if live.alarms.is_empty() { p .quiet { (say(Text::NoAlarm)) } }
-            @for alarm in &live.alarms { (standing(alarm, language)) }
+            @for alarm in &live.alarms { (standing(alarm, acknowledged(&seen.summary, alarm), true, language)) }
         };
     }
     let told = &seen.summary.alarms;
     html! {
         @if told.is_empty() && !seen.summary.run.is_empty() { p .quiet { (say(Text::NoAlarmRaised)) } }
-        @for AlarmHistory { alarm, raised, withdrawn } in told {
+        @for AlarmHistory { alarm, raised, withdrawn, acknowledged } in told {
             @if withdrawn.is_none() && seen.is_lost() {
-                (standing(alarm, language))
+                (standing(alarm, acknowledged.as_ref(), false, language))
             } @else {
                 article .alarm .past {
                     h3 { (alarm_texts(alarm, language).event) }
@@ -371,14 +372,36 @@ fn alarms(seen: &ObservedRun, language: Language) -> Markup {
                             None => { (say(Text::StoodAtTheEnd)) }
                         }
                     }
+                    (acknowledgement(acknowledged.as_ref(), language))
                 }
             }
         }
     }
 }
 
-/// Returns the HTML of the active alarm `alarm`: its cause, its consequence, its remedy, and who can clear it.
-fn standing(alarm: &Alarm, language: Language) -> Markup {
+/// Returns the acknowledgement of the active alarm `alarm`, if a person has acknowledged it.
+fn acknowledged<'s>(summary: &'s RunSummary, alarm: &Alarm) -> Option<&'s AlarmAcknowledgement> {
+    let active = summary.alarms.iter().rev().find(|told| told.alarm.id == alarm.id && told.withdrawn.is_none());
+    active.and_then(|told| told.acknowledged.as_ref())
+}
+
+/// Returns the HTML that names who has acknowledged an alarm, and when. It is empty if nobody has.
+fn acknowledgement(acknowledged: Option<&AlarmAcknowledgement>, language: Language) -> Markup {
+    html! {
+        @if let Some(AlarmAcknowledgement { by, at, remark }) = acknowledged {
+            p .quiet { (Text::SeenBy.to(language)) " " (by) ", " (when(at)) @if !remark.is_empty() { ": " (remark) } }
+        }
+    }
+}
+
+/// Returns the HTML of the active alarm `alarm`: its cause, its consequence, its remedy, who can clear it, and who has
+/// acknowledged it. `can_acknowledge` is true if a person can acknowledge it now.
+fn standing(
+    alarm: &Alarm,
+    acknowledged: Option<&AlarmAcknowledgement>,
+    can_acknowledge: bool,
+    language: Language,
+) -> Markup {
     let (say, said) = (|text: Text| text.to(language), alarm_texts(alarm, language));
     html! {
         article .alarm {
@@ -391,6 +414,11 @@ fn standing(alarm: &Alarm, language: Language) -> Markup {
                 Role::Operator => Text::ByOperator,
                 _ => Text::ByEngineer,
             })) }
+            (acknowledgement(acknowledged, language))
+            @if can_acknowledge && acknowledged.is_none() {
+                @let id = serde_json::to_value(alarm.id).unwrap_or_default();
+                button type="button" data-order="remark" data-alarm=[id.as_str()] { (say(Text::SeenAlarm)) }
+            }
         }
     }
 }

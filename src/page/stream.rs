@@ -13,10 +13,10 @@ use serde_json::{Map, Value, json};
 use tokio::sync::watch::Receiver;
 
 use super::guard::Session;
+use super::language::Language;
 use super::live::ObservedRun;
 use super::pieces::{Piece, run_pieces};
 use super::shared::Shared;
-use super::texts::Language;
 use super::view;
 use super::viewers::Viewer;
 

@@ -20,11 +20,12 @@ use tokio::task::spawn_blocking;
 use super::chart::chart;
 use super::guard::{Denied, Session, text};
 use super::history::Listed;
+use super::language::{Language, decimal};
 use super::live::{ObservedRun, verdict};
 use super::pieces::{Piece, about, banner, figures, in_path, is_over, lacks_reason, run_pieces, verdict_reason, when};
 use super::shared::Shared;
 use super::subject::PageSubject;
-use super::texts::{self, Language, Text, decimal};
+use super::texts::{self, Text};
 use super::users::Person;
 
 /// Returns the state of a run as JSON for the scripts of the page. `seen` is the current status of the run. `session`
@@ -69,9 +70,9 @@ pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) ->
 
 /// Returns the names of the orders that the browser can give now, such as `hold`. `live` is the current state of the
 /// cell, and the role of the person of `session` limits the orders. `has_control` is true if the browser has control of
-/// the cell, or if no browser has control. Without control, only `hold`, `stop` and `abort` are possible.
+/// the cell, or if no browser has control. Without control, only `hold`, `stop`, `abort` and `remark` are possible.
 fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static str> {
-    let mut can = vec!["hold", "stop", "abort"];
+    let mut can = vec!["hold", "stop", "abort", "remark"];
     if is_over(live.state) {
         can.clear();
     }
@@ -169,7 +170,11 @@ fn cell(seen: &ObservedRun, id: &str, session: &Session, has_control: bool, lang
                 section .card {
                     h2 { (say(Text::ThisRun)) }
                     div #about { (piece(Piece::About)) }
-                    p { a href=(format!("/runs/{}/report", in_path(id))) { (say(Text::Report)) } }
+                    p .links {
+                        a href=(format!("/runs/{}/report", in_path(id))) { (say(Text::Report)) }
+                        " " a href=(format!("/runs/{}/record", in_path(id))) { (say(Text::Record)) }
+                        " " a href=(format!("/runs/{}/record?show=people", in_path(id))) { (say(Text::ShiftLog)) }
+                    }
                 }
             }
         }
@@ -248,6 +253,11 @@ fn script_texts(language: Language) -> Value {
 fn colours(of: ColourMap) -> String {
     let colour = |k: u32| of.at(f64::from(k) / 254.0);
     HEXLOWER.encode(&(0..255).flat_map(colour).collect::<Vec<u8>>())
+}
+
+/// Returns a page of the cell without maps.
+pub(super) fn plain_document(title: &str, session: &Session, language: Language, main: Markup) -> Response {
+    document(title, &Frame { language, person: session.person.as_ref(), kind: Kind::Plain(PageSubject::Cell) }, main)
 }
 
 /// Filter for a list of runs. An empty field matches all runs.
@@ -569,7 +579,7 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                         @if !matches!(kind, Kind::Plant { .. }) {
                             label { (say(Text::Language)) " "
                                 select #language {
-                                    @for each in Language::ALL {
+                                    @for &each in Language::ALL {
                                         option value=(each.tag()) lang=(each.tag()) selected[each == language] { (each.name()) }
                                     }
                                 }

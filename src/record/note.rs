@@ -1,6 +1,6 @@
 //! Notes: what people confirmed, and what machines and programs reported besides events.
 
-use regrind_cell::Device;
+use regrind_cell::{AlarmId, Device};
 use regrind_formats::result::Coordinates;
 use regrind_journal::or_none;
 use serde::{Deserialize, Serialize};
@@ -60,6 +60,9 @@ pub struct MachineNotes {
 pub struct Remark {
     /// Text.
     pub remark: String,
+    /// Alarm that the person acknowledges with this remark.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub alarm: Option<AlarmId>,
 }
 
 /// Note with the report of the grinder about a pass.

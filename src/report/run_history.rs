@@ -6,12 +6,12 @@ use std::path::Path;
 use super::ReportError;
 use super::words::{gate_words, words};
 use regrind_cell::{
-    Alarm, Command, Device, Ending, Event, Figures, GateResult, JobResult, Judgement, Reconciliation,
+    Alarm, AlarmId, Command, Device, Ending, Event, Figures, GateResult, JobResult, Judgement, Reconciliation,
     RecordedParameter, Tolerance,
 };
 use regrind_formats::run_files::{CycleFile, CycleFolder};
 use regrind_journal::{Reader, Record, RecordKind, Verified, verify};
-use regrind_record::{Begin, Content, EventDetail, EventRecord, PartEnd, RunContent, RunEnd, TouchCounts};
+use regrind_record::{Begin, Content, EventDetail, EventRecord, PartEnd, Remark, RunContent, RunEnd, TouchCounts};
 
 #[derive(Default)]
 pub(super) struct RunHistory {
@@ -102,6 +102,19 @@ pub struct AlarmHistory {
     pub raised: String,
     /// Time at which it was withdrawn; `None` if it was active until the end of the record.
     pub withdrawn: Option<String>,
+    /// Last acknowledgement by a person while the alarm was active.
+    pub acknowledged: Option<AlarmAcknowledgement>,
+}
+
+/// Acknowledgement of an alarm: somebody has seen it and takes care.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AlarmAcknowledgement {
+    /// Name of the person.
+    pub by: String,
+    /// Time, RFC 3339 in UTC.
+    pub at: String,
+    /// Remark of the person; empty if none was given.
+    pub remark: String,
 }
 
 /// Order of a person to hold the cell.
@@ -170,13 +183,15 @@ impl RunHistory {
                 }
                 self.end = Some(record);
             }
+            Content::Remark(Remark { remark, alarm }) => {
+                alarm.into_iter().for_each(|id| self.add_acknowledgement(&record, id, &remark));
+            }
             Content::Pass(pass) => {
                 self.wheel_radius_mm = pass.pass_record.wheel_radius_mm.or(self.wheel_radius_mm);
             }
             Content::Reopen(_)
             | Content::Answer(_)
             | Content::MachineNotes(_)
-            | Content::Remark(_)
             | Content::Transfer(_)
             | Content::Seal(_)
             | Content::Unknown(_) => {}
@@ -201,12 +216,21 @@ impl RunHistory {
         })
     }
 
+    /// Adds the acknowledgement of the alarm `id`, if this alarm is active.
+    fn add_acknowledgement(&mut self, record: &Record, id: AlarmId, remark: &str) {
+        let standing = |alarm: &&mut AlarmHistory| alarm.alarm.id == id && alarm.withdrawn.is_none();
+        if let Some(alarm) = self.alarms.iter_mut().rev().find(standing) {
+            let (by, at) = (record.actor.clone(), record.utc.clone());
+            alarm.acknowledged = Some(AlarmAcknowledgement { by, at, remark: remark.to_owned() });
+        }
+    }
+
     fn add_command(&mut self, record: Record, command: Command) {
         match command {
             Command::LoadPass { cycle } | Command::LoadPlan { cycle } => drop(self.cycle(cycle)),
             Command::Announce(judgement) => self.measurement(judgement.cycle).judgements.push(judgement),
             Command::Raise(alarm) => {
-                self.alarms.push(AlarmHistory { alarm, raised: record.utc, withdrawn: None });
+                self.alarms.push(AlarmHistory { alarm, raised: record.utc, withdrawn: None, acknowledged: None });
             }
             Command::Withdraw { alarm } => {
                 let standing = |a: &&mut AlarmHistory| a.alarm.id == alarm && a.withdrawn.is_none();

@@ -44,7 +44,11 @@ fn content_words(content: &Content) -> Option<String> {
             Some(format!("{device}: order {recover} to recover the machine; state before the order: {seen}"))
         }
         Content::MachineNotes(MachineNotes { device, notes }) => Some(format!("{device}: {}", notes.join("; "))),
-        Content::Remark(Remark { remark }) => Some(remark.clone()),
+        Content::Remark(Remark { remark, alarm: None }) => Some(remark.clone()),
+        Content::Remark(Remark { remark, alarm: Some(alarm) }) => {
+            let remark = if remark.is_empty() { String::new() } else { format!(": {remark}") };
+            Some(format!("alarm acknowledged, {}{remark}", alarm.head()))
+        }
         Content::Pass(pass) => Some(pass_words(&pass.pass_record)),
         Content::Transfer(note) => Some(transfer_words(&note.transfer)),
         Content::Artefact(Artefact { name, bytes, sha256 }) => {

@@ -59,7 +59,7 @@ fn foreign_orders_refused_and_recorded() {
     assert!(again.status == 303 && same, "{again:?}");
     // Requests that are not orders of the page: those of programs, one that names no state, one too long, nonsense.
     for body in
-        [&br#"{"order":"remark","what":"x"}"#[..], br#"{"order":"status"}"#, br#"{"order":"watch"}"#, b"{}", b"\xff\0"]
+        [&br#"{"order":"touches","from":0}"#[..], br#"{"order":"status"}"#, br#"{"order":"watch"}"#, b"{}", b"\xff\0"]
     {
         assert_eq!(post(&visitor, &own(), body), 400, "{}", String::from_utf8_lossy(body));
     }

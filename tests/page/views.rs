@@ -134,9 +134,10 @@ fn serve_refuses_public_or_used_address() {
     assert!(code == 2 && errors.contains("--listen"), "{errors}");
 }
 
-/// The configured radius of the probe differs from that on the sphere: the cell is held, and a person ends the run.
+/// The configured radius of the probe differs from that on the sphere: the cell is held. A person acknowledges the alarm,
+/// makes an entry in the log of the shift, and ends the run.
 #[test]
-fn stopped_run_shows_last_alarms() {
+fn alarms_are_acknowledged_and_stay_after_stop() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 1e5);
     let text = std::fs::read_to_string(&recipe).unwrap();
@@ -152,8 +153,27 @@ fn stopped_run_shows_last_alarms() {
     let folder = shown.folder.clone();
     let state = || run(&["status", &folder.display().to_string()], home.path()).1;
     shown.run.until("a held cell", |_| state().contains("Held").then_some(()));
+    let remark = |alarm: Value, what: &str| {
+        visitor.order(&shown.id, &json!({ "order": "remark", "alarm": alarm, "what": what })).1
+    };
+    assert!(!remark(json!("link_lost"), ""), "this alarm is not active");
+    assert!(!remark(Value::Null, " "), "an entry without a text");
+    assert!(visitor.get(&path).text().contains("data-alarm=\"probe_radius\""));
+    assert!(remark(json!("probe_radius"), "the ball is dirty"));
+    assert!(remark(Value::Null, "coolant filled up"));
+    let seen = shown.page.until("the acknowledgement", |_| {
+        let alarms = piece(visitor.get(&path).text(), "alarms");
+        alarms.contains("Seen by").then_some(alarms)
+    });
+    assert!(seen.contains("the ball is dirty") && !seen.contains("data-alarm"), "{seen}");
     assert_eq!(run(&["stop", &folder.display().to_string()], home.path()).0, 0);
     shown.run.end();
+    let log = visitor.get(&format!("{path}/record?show=people")).text();
+    assert!(
+        log.contains("shift log: coolant filled up") && log.contains("alarm acknowledged, The radius of the probe"),
+        "{log}"
+    );
+    assert!(log.contains("The record is as it was written") && !log.contains("grinder: connect"), "{log}");
     let alarms = shown.page.until("the alarms of the record", |_| {
         let alarms = piece(visitor.get(&path).text(), "alarms");
         alarms.contains("active at the end").then_some(alarms)
@@ -222,4 +242,32 @@ fn reason_of_hold_is_recorded_on_page() {
     assert!(!page(&visitor).contains("id=\"hold-reason\""));
     assert_eq!(number(&status()), now, "the state is the same");
     shown.run.signal("KILL");
+}
+
+/// The record of a run is read in pages from the newest record to the oldest. A changed record is told of.
+#[test]
+fn record_is_shown_and_verified() {
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = CellPage::begin(home.path(), 1e5);
+    assert_eq!(shown.run.end().0, 0);
+    let visitor = shown.visitor();
+    let path = format!("/runs/{}/record", shown.id);
+    let numbers = |text: &str| -> Vec<u64> {
+        text.split("<tr><td class=\"n\">").skip(1).map(|row| row.split('<').next().unwrap().parse().unwrap()).collect()
+    };
+    let (mut address, mut all) = (path.clone(), Vec::new());
+    loop {
+        let text = visitor.get(&address).text();
+        assert!(text.contains("The record is as it was written"), "{text}");
+        all.extend(numbers(&text));
+        let Some(older) = text.split("record?show=all&amp;before=").nth(1) else { break };
+        address = format!("{path}?show=all&before={}", older.split('"').next().unwrap());
+    }
+    assert!(all.len() > 100 && all.iter().copied().eq((1..=all.len() as u64).rev()), "{all:?}");
+    let events = visitor.get(&format!("{path}?show=events")).text();
+    assert!(events.contains("grinder: started") && !events.contains("<td>intent</td>"));
+    assert_eq!(visitor.get("/runs/none/record").status, 404);
+    let recipe = shown.folder.join("recipe.toml");
+    std::fs::write(&recipe, "# another recipe\n").unwrap();
+    assert!(visitor.get(&path).text().contains("The record is not as it was written"));
 }

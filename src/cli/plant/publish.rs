@@ -308,7 +308,7 @@ async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
         &format!("refused a request of {by}: {what}; live values can only be read"),
     );
     let runs = runs.to_owned();
-    let remark = Request::Remark { what: format!("live values: refused: {what}") };
+    let remark = Request::Remark { what: format!("live values: refused: {what}"), alarm: None };
     let by = OnBehalf { name: None, station: by.to_owned() };
     // A run that does not answer delays only this report.
     let recorded = tokio::task::spawn_blocking(move || {

@@ -127,6 +127,7 @@
     started: (button) => ({ order: "started", map: button.dataset.map || null }),
     done: (button) => ({ order: "done", map: button.dataset.map || null }),
     still: (button) => ({ order: "still", device: button.dataset.device }),
+    remark: (button) => ({ order: "remark", alarm: button.dataset.alarm }),
     over: (button) => ({ order: "over", device: button.dataset.device, evidence: element("evidence").value.trim() }),
   };
 

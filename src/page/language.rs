@@ -1,0 +1,171 @@
+//! Languages of the page. Each language has one file in `languages/` with all its texts.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::LazyLock;
+
+use regrind_cell::AlarmId;
+use serde::Deserialize;
+
+macro_rules! languages {
+    ($($(#[$default:meta])? $id:ident $tag:literal)+) => {
+        /// Language of the page.
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+        pub(crate) enum Language {
+            $($(#[$default])? $id,)+
+        }
+
+        impl Language {
+            pub(crate) const ALL: &[Self] = &[$(Self::$id),+];
+
+            /// Returns the language tag for HTML and browsers, such as `en`.
+            pub(crate) fn tag(self) -> &'static str {
+                [$($tag),+][self as usize]
+            }
+
+            fn catalogue(self) -> &'static Catalogue {
+                static CATALOGUES: LazyLock<Vec<Catalogue>> = LazyLock::new(|| {
+                    let files = [$(include_str!(concat!("languages/", $tag, ".toml"))),+];
+                    files.into_iter().map(|text| Catalogue::read(text).unwrap_or_default()).collect()
+                });
+                &CATALOGUES[self as usize]
+            }
+
+            #[cfg(test)]
+            fn file(self) -> &'static str {
+                [$(include_str!(concat!("languages/", $tag, ".toml"))),+][self as usize]
+            }
+        }
+    };
+}
+
+languages! {
+    #[default]
+    En "en"
+    De "de"
+    Zh "zh"
+}
+
+/// Texts of an alarm in a language other than English, the language of the record.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct AlarmEntry {
+    /// General description of the event. The values of the alarm follow it.
+    pub(crate) event: String,
+    pub(crate) consequence: String,
+    /// Steps of the remedy, in this order.
+    pub(crate) remedy: Vec<String>,
+}
+
+/// Texts of one language.
+#[derive(Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Catalogue {
+    name: String,
+    decimal_sign: String,
+    /// Texts of the page. The keys have the names of the variants of `Text`.
+    page: HashMap<String, String>,
+    #[serde(default)]
+    alarms: BTreeMap<AlarmId, AlarmEntry>,
+}
+
+impl Catalogue {
+    fn read(text: &str) -> Result<Self, toml::de::Error> {
+        let mut catalogue: Self = toml::from_str(text)?;
+        catalogue.page = catalogue.page.into_iter().map(|(key, text)| (variant_name(&key), text)).collect();
+        Ok(catalogue)
+    }
+}
+
+/// Returns the name of the variant for a key, such as `NotConnected` for `not_connected`.
+fn variant_name(key: &str) -> String {
+    let word = |word: &str| {
+        let mut letters = word.chars();
+        letters.next().map(|first| first.to_ascii_uppercase()).into_iter().chain(letters).collect::<String>()
+    };
+    key.split('_').map(word).collect()
+}
+
+impl Language {
+    /// Returns the name of the language in the language itself.
+    pub(crate) fn name(self) -> &'static str {
+        &self.catalogue().name
+    }
+
+    /// Returns the text of the page with the name `name`, such as `NotConnected`. Tests hold that every language has
+    /// every text.
+    pub(crate) fn text(self, name: &str) -> &'static str {
+        self.catalogue().page.get(name).map_or("", String::as_str)
+    }
+
+    /// Returns the texts of an alarm. Returns `None` if the language has none: then the texts of the record are used.
+    pub(crate) fn alarm(self, id: AlarmId) -> Option<&'static AlarmEntry> {
+        self.catalogue().alarms.get(&id)
+    }
+
+    /// Returns the first language in `tags` that the page supports. `tags` is a list separated by commas, such as the
+    /// value of the header `Accept-Language`. The order of the list decides; weights such as `q=0.5` are ignored.
+    /// Returns `None` if the page supports none of the languages.
+    pub(crate) fn first_of(tags: &str) -> Option<Self> {
+        tags.split(',').find_map(|tag| {
+            let primary = tag.trim().split(['-', ';', '_']).next()?.to_ascii_lowercase();
+            Self::ALL.iter().copied().find(|language| language.tag() == primary)
+        })
+    }
+}
+
+/// Formats a number with the given number of decimals, and with the decimal sign of `language`.
+pub(crate) fn decimal(value: f64, digits: usize, language: Language) -> String {
+    format!("{value:.digits$}").replacen('.', &language.catalogue().decimal_sign, 1)
+}
+
+/// Formats a number with all its decimals, and with the decimal sign of `language`.
+pub(crate) fn shortest(value: f64, language: Language) -> String {
+    value.to_string().replacen('.', &language.catalogue().decimal_sign, 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_language_has_every_text() {
+        let english = Catalogue::read(Language::En.file()).unwrap();
+        for language in Language::ALL {
+            let read = Catalogue::read(language.file()).unwrap_or_else(|error| panic!("{language:?}: {error}"));
+            for key in english.page.keys() {
+                assert!(read.page.get(key).is_some_and(|text| !text.trim().is_empty()), "{language:?} has no {key}");
+            }
+            for key in read.page.keys() {
+                assert!(english.page.contains_key(key), "{language:?}: {key} is in no other language");
+            }
+            assert!(!read.name.is_empty() && read.decimal_sign.chars().count() == 1, "{language:?}");
+        }
+    }
+
+    #[test]
+    fn keys_become_variant_names() {
+        for (key, name) in [("cell", "Cell"), ("not_connected", "NotConnected"), ("", ""), ("a__b", "AB")] {
+            assert_eq!(variant_name(key), name);
+        }
+    }
+
+    #[test]
+    fn first_of_accept_language() {
+        for (tags, expected) in [
+            ("de-DE,de;q=0.9,en;q=0.8", Some(Language::De)),
+            ("fr, zh-Hans-CN;q=0.8", Some(Language::Zh)),
+            ("EN_us", Some(Language::En)),
+            ("fr", None),
+            ("", None),
+            (";;,,-", None),
+        ] {
+            assert_eq!(Language::first_of(tags), expected, "{tags}");
+        }
+    }
+
+    #[test]
+    fn numbers_have_sign_of_language() {
+        assert_eq!([decimal(1.25, 1, Language::De), decimal(-0.5, 2, Language::En)], ["1,2", "-0.50"]);
+        assert_eq!([shortest(1e-3, Language::De), shortest(12.0, Language::De)], ["0,001", "12"]);
+    }
+}
