@@ -1,7 +1,7 @@
 //! Read-only view of a journal, also while another process writes it.
 
 use std::path::Path;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use rusqlite::Connection;
 
@@ -64,16 +64,69 @@ pub fn has_record(folder: &Path) -> bool {
     folder.join(DATABASE).is_file()
 }
 
-/// Modification time and length in bytes of the database and of its log. A stamp differs from an earlier one if a
-/// record was added in between.
-pub type Stamp = [Option<(SystemTime, u64)>; 2];
+/// Time after a change of a file during which a reader may not see the change yet. The database writes a record into its
+/// log first. Readers see the record only when the disk has it.
+const UNSETTLED: Duration = Duration::from_secs(5);
+
+/// Modification time and length in bytes of the database and of its log, for a cache of what was read.
+///
+/// A stamp equals an earlier one if no record was added in between, and if a reader at the earlier time saw all records.
+/// Soon after a change, a stamp equals no other one, not even itself.
+#[derive(Clone, Copy, Debug)]
+pub struct Stamp {
+    files: [Option<(SystemTime, u64)>; 2],
+    is_settled: bool,
+}
+
+impl Stamp {
+    /// Returns the time of the last change; `None` if there are no files.
+    pub fn changed_at(&self) -> Option<SystemTime> {
+        self.files.iter().flatten().map(|(at, _)| *at).max()
+    }
+}
+
+impl PartialEq for Stamp {
+    fn eq(&self, other: &Self) -> bool {
+        self.is_settled && other.is_settled && self.files == other.files
+    }
+}
 
 /// Returns the modification time and the length in bytes of two files of a run folder: the database, and the
-/// write-ahead log of the database. If the result differs from that of an earlier call, a record was added in between.
-/// The item of a file that does not exist is `None`.
+/// write-ahead log of the database. Take the stamp before you read the record, and keep both. What you have read is the
+/// whole record as long as the stamp equals a new one.
 pub fn stamp(folder: &Path) -> Stamp {
-    [DATABASE.to_owned(), format!("{DATABASE}-wal")].map(|name| {
+    stamp_at(folder, SystemTime::now())
+}
+
+fn stamp_at(folder: &Path, now: SystemTime) -> Stamp {
+    let files = [DATABASE.to_owned(), format!("{DATABASE}-wal")].map(|name| {
         let metadata = std::fs::metadata(folder.join(name)).ok()?;
         Some((metadata.modified().ok()?, metadata.len()))
-    })
+    });
+    let is_old = |at: &SystemTime| now.duration_since(*at).is_ok_and(|age| age > UNSETTLED);
+    Stamp { files, is_settled: files.iter().flatten().all(|(at, _)| is_old(at)) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fresh_stamp_equals_no_other() {
+        let home = tempfile::tempdir().unwrap();
+        let nothing = stamp(home.path());
+        assert!(nothing == stamp(home.path()) && nothing.changed_at().is_none());
+        std::fs::write(home.path().join(DATABASE), "one").unwrap();
+        let changed = stamp(home.path()).changed_at().unwrap();
+        let at = |seconds: u64| stamp_at(home.path(), changed + Duration::from_secs(seconds));
+        for (a, b, is_same) in [(0, 0, false), (1, 60, false), (60, 70, true)] {
+            assert_eq!(at(a) == at(b), is_same, "{a} s and {b} s after the change");
+        }
+        // A clock that was set back: the file seems to be from the future.
+        assert!(stamp_at(home.path(), changed - Duration::from_secs(60)) != at(60));
+        let before = at(60);
+        std::fs::write(home.path().join(DATABASE), "longer").unwrap();
+        let changed = stamp(home.path()).changed_at().unwrap();
+        assert!(before != stamp_at(home.path(), changed + Duration::from_secs(60)));
+    }
 }

@@ -22,6 +22,7 @@ mod language;
 mod live;
 mod operator_step;
 mod orders;
+mod parts_view;
 mod pieces;
 mod rate;
 mod record_view;
@@ -111,6 +112,8 @@ fn routes(page: Shared) -> Router {
     Router::new()
         .route("/", get(view::home))
         .route("/runs", get(view::runs))
+        .route("/parts", get(parts_view::parts))
+        .route("/parts/{serial}", get(parts_view::part))
         .route("/compare", get(view::compare))
         .route("/runs/{run}", get(view::run))
         .route("/runs/{run}/events", get(stream::events))

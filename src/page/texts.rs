@@ -31,7 +31,7 @@ macro_rules! texts {
 // The texts themselves are in `languages/`.
 texts! {
     // The frame of the page.
-    Cell Runs Record ShiftLog Events NewEntry AddEntry Time Who Kind What Older RecordIntact SignedUpTo NotSigned RecordBroken
+    Cell Runs Parts Record ShiftLog Events NewEntry AddEntry Time Who Kind What Older RecordIntact SignedUpTo NotSigned RecordBroken
     Compare Language Appearance AsTheSystem Light Dark HighContrast SkipToOrders Simulation
     NotConnected ProgramGone SimulationGone PageGone
     // Texts about the part.

@@ -566,7 +566,7 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                 nav {
                     span .brand { "Regrind" }
                     @match kind.subject() {
-                        PageSubject::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } }
+                        PageSubject::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } " " a href="/parts" { (say(Text::Parts)) } }
                         PageSubject::Plant => {
                             @for (path, name) in [("/", "Plant"), ("/trend", "Trend"), ("/cells", "Compare"), ("/parts", "Parts")] { a href=(path) { (name) } " " }
                         }

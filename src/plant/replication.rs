@@ -117,7 +117,7 @@ impl Replicator {
             .filter(|(at, name)| self.settled.get(name) != Some(at) && !self.skipped.contains_key(name))
             .map(|(stamp, name)| (name, stamp))
             .collect();
-        open.sort_by_key(|(_, stamp)| std::cmp::Reverse(stamp.iter().flatten().map(|(at, _)| *at).max()));
+        open.sort_by_key(|(_, stamp)| std::cmp::Reverse(stamp.changed_at()));
         open
     }
 

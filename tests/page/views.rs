@@ -244,6 +244,26 @@ fn reason_of_hold_is_recorded_on_page() {
     shown.run.signal("KILL");
 }
 
+/// Two runs of one part: its page has the maps of both. A part that was never made has no page.
+#[test]
+fn runs_of_part_are_shown_together() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e5).display().to_string();
+    let make = |part: &str| run(&["run", &recipe, "--cell", "sim", "--part", part], home.path()).0;
+    assert_eq!(["SN 7/A", "SN 7/A", "SN-8"].map(make), [0; 3]);
+    let (_serving, url) = serve(home.path());
+    let visitor = Visitor::with_key(&url);
+    let parts = visitor.get("/parts").text();
+    assert_eq!(parts.matches("href=\"/parts/").count(), 2, "{parts}");
+    let address =
+        parts.split("href=\"").find(|rest| rest.starts_with("/parts/SN%207")).unwrap().split('"').next().unwrap();
+    let page = visitor.get(address).text();
+    assert_eq!(page.matches("part-run").count(), 2, "{page}");
+    let map = page.split("src=\"").nth(1).and_then(|rest| rest.split('"').next()).unwrap();
+    assert_eq!(visitor.get(map).status, 200, "{map}");
+    assert_eq!(visitor.get("/parts/none").status, 404);
+}
+
 /// The record of a run is read in pages from the newest record to the oldest. A changed record is told of.
 #[test]
 fn record_is_shown_and_verified() {
