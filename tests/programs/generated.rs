@@ -292,7 +292,7 @@ impl Draw {
             ("G1 X3 P2", "no meaning"),
             ("G43 H1\nG1 X2 F100", "position of Z is unknown"),
             ("G49\nG1 X2 F100", "position of Z is unknown"),
-            ("M6 T2\nG1 X2 F100", "is unknown"),
+            ("M6 T2\nG1 X2 F100", "unknown"),
             ("G92 X0", "zero"),
             ("G1 X1 A7", "turns"),
             ("G2 X9", "centre"),

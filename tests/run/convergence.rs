@@ -31,7 +31,9 @@ fn cycles_converge_to_repeatability() {
         let (first, last) = (parts[0][0], parts[0][usize::from(PASSES) - 1]);
         assert!(last.rms_um < first.rms_um, "{name} ended worse than it began");
         let taken_back = first.repeatable_um / parts[0][1].repeatable_um;
-        assert!(taken_back > 5.0, "{name}: one correction took back {taken_back} times");
+        // The correction is made from one pass, and grinds in the random error of this pass.
+        let limit_um = (first.repeatable_um / 5.0).max(2.0 * first.floor_um);
+        assert!(parts[0][1].repeatable_um < limit_um, "{name}: one correction took back {taken_back} times");
     }
     let over = |part: usize, pass: usize| {
         let all = || runs.iter().map(move |(_, parts)| parts[part][pass]);
