@@ -5,11 +5,13 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use regrind::cell::Device;
+use regrind::cell::{AlarmId, Device};
 use regrind::drive::{CycleRow, JobProgress, Reply, Request, Snapshot, is_live, send_request};
 use regrind::journal::{MachineLock, Reader, Record, RecordKind};
 use regrind::record::{Begin, RunContent};
 use regrind_control::{is_live_at, send_request_at};
+use serde::Deserialize;
+use serde::de::value::StrDeserializer;
 
 use super::Outcome;
 use super::choice::word_of;
@@ -55,6 +57,7 @@ Examples:
   regrind confirm done --file points.csv
   regrind confirm done --map 3fa9c210           for machines that take files, see docs/file-exchange.md
   regrind confirm clear --machine cmm
+  regrind confirm seen --alarm link_lost        an alarm was seen; this clears nothing
   regrind confirm over --machine grinder --evidence \"at rest, wheel up, one pass was ground\"
 
 Exit codes: 0 the cell accepted the confirmation; 2 no such run; 3 the cell refused the confirmation, or did not
@@ -75,7 +78,10 @@ pub(super) struct Confirmation {
     /// File of the measurement, for `done` of a measuring machine that a person serves
     #[arg(long, value_name = "FILE")]
     file: Option<PathBuf>,
-    /// Observation at the machine, for `over`
+    /// Active alarm that was seen, by its name in the record, for `seen`
+    #[arg(long, value_name = "ALARM", value_parser = alarm_named)]
+    alarm: Option<AlarmId>,
+    /// Observation at the machine, for `over` and `seen`
     #[arg(long, value_name = "TEXT", default_value = "", value_parser = super::remark)]
     evidence: String,
     /// Print the answer as JSON
@@ -97,6 +103,14 @@ enum ConfirmedState {
     Still,
     /// A job whose state no machine can report is over: the machine is at rest, clear of the part
     Over,
+    /// A person has seen an alarm and takes care; this clears nothing
+    Seen,
+}
+
+/// Reads the name of an alarm, such as `link_lost`.
+fn alarm_named(name: &str) -> Result<AlarmId, String> {
+    let unknown = "no alarm has this name; `regrind status --json` has the active alarms with their names";
+    AlarmId::deserialize(StrDeserializer::<serde::de::value::Error>::new(name)).map_err(|_| unknown.to_owned())
 }
 
 /// Sends an order to the cell of the run that `arguments` name, and prints the reply. `order` is a function that builds
@@ -119,6 +133,8 @@ pub(super) fn confirm(arguments: &Confirmation) -> Result<Outcome, Failure> {
             Request::Over { device, evidence: arguments.evidence.clone() }
         }
         (ConfirmedState::Over, _) => return Err(Failure::Evidence),
+        (ConfirmedState::Seen, _) if arguments.alarm.is_none() => return Err(Failure::NoAlarm),
+        (ConfirmedState::Seen, _) => Request::Remark { what: arguments.evidence.clone(), alarm: arguments.alarm },
     };
     give(arguments.run.as_deref(), &request, arguments.json)
 }

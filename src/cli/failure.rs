@@ -190,6 +190,8 @@ pub(super) enum Failure {
     ShortMap,
     #[error("the command `confirm clear` requires the option --machine with the machine that you checked")]
     NoMachine,
+    #[error("the command `confirm seen` requires the option --alarm with the name of the alarm that you saw")]
+    NoAlarm,
     #[error("{path} already exists; choose another folder, or move the existing one away")]
     IsThere { path: PathBuf },
     #[error("the model of the error cannot be computed: {0}")]

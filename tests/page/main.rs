@@ -7,6 +7,7 @@
 regrind_testcell::program!();
 
 mod in_a_browser;
+mod speed;
 mod strangers;
 mod users;
 mod views;

@@ -159,13 +159,18 @@ fn alarms_are_acknowledged_and_stay_after_stop() {
     assert!(!remark(json!("link_lost"), ""), "this alarm is not active");
     assert!(!remark(Value::Null, " "), "an entry without a text");
     assert!(visitor.get(&path).text().contains("data-alarm=\"probe_radius\""));
+    let seen = |alarm: &[&str]| run(&[&["confirm", "seen"], alarm].concat(), home.path());
+    let unknown = seen(&["--alarm", "no_such_alarm"]);
+    assert!(unknown.0 == 2 && unknown.2.contains("status --json"), "{unknown:?}");
+    assert_eq!([seen(&[]).0, seen(&["--alarm", "link_lost"]).0], [2, 3]);
+    assert_eq!(seen(&["--alarm", "probe_radius"]).0, 0);
     assert!(remark(json!("probe_radius"), "the ball is dirty"));
     assert!(remark(Value::Null, "coolant filled up"));
     let seen = shown.page.until("the acknowledgement", |_| {
         let alarms = piece(visitor.get(&path).text(), "alarms");
-        alarms.contains("Seen by").then_some(alarms)
+        alarms.contains("the ball is dirty").then_some(alarms)
     });
-    assert!(seen.contains("the ball is dirty") && !seen.contains("data-alarm"), "{seen}");
+    assert!(seen.contains("Seen by") && !seen.contains("data-alarm"), "{seen}");
     assert_eq!(run(&["stop", &folder.display().to_string()], home.path()).0, 0);
     shown.run.end();
     let log = visitor.get(&format!("{path}/record?show=people")).text();
