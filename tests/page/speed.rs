@@ -39,11 +39,12 @@ fn first_paint_ms(browser: &mut Browser, tab: &Tab) -> f64 {
     median(times.collect())
 }
 
-/// Returns the median time in ms that a click takes until the page has drawn its effect.
+/// Returns the median time in ms from a click to the frame after the one that shows its effect. This contains at least
+/// one interval of frames, 16.7 ms.
 fn redraw_ms(browser: &mut Browser, tab: &Tab, selector: &str) -> f64 {
     let click = format!(
         "(async () => {{ const began = performance.now(); document.querySelector('{selector}').click(); \
-         const drawn = performance.now(); await new Promise(requestAnimationFrame); return drawn - began; }})()"
+         for (let k = 0; k < 2; k++) await new Promise(requestAnimationFrame); return performance.now() - began; }})()"
     );
     median((0..TIMES).map(|_| tab.read(browser, &click).as_f64().unwrap()).collect())
 }
@@ -58,7 +59,8 @@ fn page_with_many_points_is_fast() {
     let text = replaced(&text, "columns = 16", "columns = 226");
     std::fs::write(&recipe, replaced(&text, "rows = 12", "rows = 126")).unwrap();
     let mut shown = CellPage::start(home.path(), &recipe);
-    assert_eq!(shown.run.end().0, 0);
+    // The map of the first cycle is enough, whatever the verdict on the part is.
+    assert!(shown.run.end().0 <= 1);
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&shown.url, [1366, 768]);
     tab.until(&mut browser, "document.querySelectorAll('#cycle option').length > 0");
