@@ -1,15 +1,18 @@
 //! Ground truth of a simulated grinding cell.
 //!
 //! This crate uses no type of the controller. The truth therefore cannot leak into the controller, and an error in the
-//! controller's geometry cannot hide by being repeated here. Surfaces are closed forms with analytic derivatives,
-//! contact is solved exactly, and all random numbers come from one seed.
+//! controller's geometry cannot hide by being repeated here. Surfaces are closed forms with analytic derivatives, or a
+//! fit of this crate's own through points. Contact is solved exactly, and all random numbers come from one seed.
 //!
 //! ```text
 //!  shape   nominal shape of the part: height, gradient, curvature in closed form
+//!  point_surface   nominal shape through points
+//!  aperture   outline of the part
 //!  form    form error left by grinding: a smooth random error along the normal
 //!  probe   a ball that touches the part, in a frame of its own, with noise and outliers
 //!
 //!  spec       the truth in one table: all errors of the cell
+//!  machine_class   errors of good, shipped and worn machines
 //!  truth      state that the two machines share, and the source of every random number
 //!  world      the two machines, and queries for tests
 //!  part       the part as it really is, and exact contact with it

@@ -1,6 +1,6 @@
 //! True part, with an aperture and a grid of its own: the truth must share no error with the code under test.
 //!
-//! The part is a closed form plus a height error that grinding changes. This module also computes the contact of a ball
+//! The part is a nominal shape plus a height error that grinding changes. This module also computes the contact of a ball
 //! with it.
 //!
 //! The height error h is given on a fine grid over the part and a little beyond, in mm along the nominal normal. It is
