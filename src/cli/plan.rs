@@ -7,7 +7,7 @@ use data_encoding::HEXLOWER;
 use regrind::cell::{CellPlan, FirstStep};
 use regrind::compensation::path::{ArcSummary, PathSummary, Peak, Scallops, ToolPath};
 use regrind::config::{BUILT_IN_CELL, CellConfig};
-use regrind::drive::{Task, foretell_refusal};
+use regrind::drive::{Task, forecast_refusal};
 use regrind::formats::gcode::GcodeError;
 use regrind::model::FIRST_BATCH;
 use regrind::recipe::{NominalSource, Recipe};
@@ -443,7 +443,7 @@ fn warning_of_refusal(task: &Task, recipe: &Recipe) -> Option<String> {
     let [pv_mm, rms_mm] =
         [recipe.acceptance.pv_um.map(|um| um.mm() / PV_OF_RMS), recipe.acceptance.rms_um.map(|um| um.mm())];
     let rms_mm = FORM_ERROR_LIMITS * rms_mm.into_iter().chain(pv_mm).fold(f64::INFINITY, f64::min);
-    let reason = (rms_mm.is_finite() && !task.targets.is_empty()).then(|| foretell_refusal(task, rms_mm))??;
+    let reason = (rms_mm.is_finite() && !task.targets.is_empty()).then(|| forecast_refusal(task, rms_mm))??;
     Some(format!(
         "a measurement of a part with {} µm rms of form error may end without a correction: {reason}",
         three_digits(1e3 * rms_mm)

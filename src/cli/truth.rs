@@ -84,12 +84,12 @@ fn outline(nominal: &Nominal) -> TrueAperture {
     }
 }
 
-/// Compares the truth in `spec` with points of the nominal surface. The shape is compared only if the recipe states it
-/// (`is_stated`).
+/// Compares the truth in `spec` with points of the nominal surface. `is_stated` is true if the recipe states the true
+/// shape. Otherwise the shape is a fit through the points of the nominal surface, which can be too coarse for it.
 ///
 /// # Errors
 /// Returns a problem if the true outline leaves out a part of the nominal surface, or if the true shape differs from
-/// it.
+/// it. Returns a problem if the recipe states that the shape is wrong, but no shape.
 fn compare(recipe: &Recipe, nominal: &Nominal, spec: &WorldSpec, is_stated: bool) -> Result<(), Problems> {
     let is_on_part = |x: f64, y: f64| nominal.outline().is_none_or(|outline| outline.contains(x, y));
     let points: Vec<&Point> = nominal.points().filter(|point| is_on_part(point.x, point.y)).collect();
@@ -105,9 +105,24 @@ fn compare(recipe: &Recipe, nominal: &Nominal, spec: &WorldSpec, is_stated: bool
             "remove the table: then the outline is that of the nominal surface",
         ));
     }
-    if !is_stated || spec.faults.wrong_shape {
-        return Ok(());
+    match (spec.faults.wrong_shape, is_stated) {
+        (true, true) => return Ok(()),
+        (true, false) => {
+            let remedy = "state the shape of the other part in simulation.part.shape, or remove the key";
+            return Err(recipe.problem("simulation.faults.wrong_shape", "is true, but no shape is stated", "", remedy));
+        }
+        (false, _) => {}
     }
+    let remedy = match is_stated {
+        true => {
+            "remove the table: then the true shape is the nominal surface; or correct the formula; or state \
+             simulation.faults.wrong_shape = true, to try out another part"
+        }
+        false => {
+            "the truth is a smooth fit through the nominal points: give points that are closer to each other and without \
+             noise, or state the formula in simulation.part.shape"
+        }
+    };
     let shape = spec.part.shape.build();
     let difference_mm = |x: f64, y: f64, z: f64| {
         let [p, q] = shape.gradient(x, y);
@@ -119,7 +134,7 @@ fn compare(recipe: &Recipe, nominal: &Nominal, spec: &WorldSpec, is_stated: bool
             "simulation.part.shape",
             &format!("is {:+.4} mm from the nominal surface at ({x:.2}, {y:.2}) mm", by_mm),
             &format!("it may differ by {} µm", 1e3 * MAX_DIFFERENCE_MM),
-            "remove the table: then the true shape is the nominal surface; or correct the formula; or state simulation.faults.wrong_shape = true, to try out another part",
+            remedy,
         )),
         _ => Ok(()),
     }

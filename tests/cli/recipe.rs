@@ -820,6 +820,17 @@ fn check_validates_simulation_table() {
     }
 }
 
+/// The known zero: the parts of the shipped recipes are accepted, so no plan expects a refusal or another unit.
+#[test]
+fn plans_of_shipped_recipes_expect_no_refusal() {
+    for name in ["biconic", "freeform-mirror", "off-axis-asphere", "shallow-wave"] {
+        let path = root().join(format!("recipes/{name}.toml"));
+        let output = Command::new(env!("CARGO_BIN_EXE_regrind")).arg("plan").arg(&path).arg("--json").output().unwrap();
+        let plan: Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(plan["warnings"], Value::Array(Vec::new()), "{name}");
+    }
+}
+
 #[test]
 fn committed_schemas_are_current() {
     let schemas = [

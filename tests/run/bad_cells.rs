@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use crate::program::{Running, changed, only_run, records_with, regrind, root, run, run_folders, small_recipe};
+use crate::program::{
+    Running, changed, only_run, records_with, regrind, replaced, root, run, run_folders, small_recipe,
+};
 use regrind::journal::verify;
 
 /// Upper bound of the time until a wrong input is reported, even on the busiest computer.
@@ -408,9 +410,16 @@ fn truth_of_other_part_refused() {
         ("value_mm = 10.5", "value_mm = 10.4", "simulation.part.shape"),
         ("half_x_mm = 51.0", "half_x_mm = 40.0", "simulation.part.aperture"),
     ];
-    for (is, other, key) in cases {
-        assert!(text.contains(is), "{is}");
-        fs::write(home.path().join("other.toml"), text.replace(is, other)).unwrap();
+    let mut texts: Vec<(String, &str)> =
+        cases.map(|(is, other, key)| (replaced(&text, is, other), key)).into_iter().collect();
+    // A wrong shape that nobody states, and points too far apart to tell the surface between them.
+    let real = text.split("# The truth of a simulated cell").next().unwrap();
+    let wrong = format!("{real}\n[simulation.faults]\nwrong_shape = true\n");
+    texts.push((wrong, "simulation.faults.wrong_shape"));
+    let coarse = replaced(real, "spacing_mm = 0.5", "spacing_mm = 8.0");
+    texts.push((format!("{coarse}\n[simulation]\nseed = 1\n"), "simulation.part.shape"));
+    for (text, key) in texts {
+        fs::write(home.path().join("other.toml"), text).unwrap();
         for command in [&["check", "other.toml"][..], &["run", "other.toml", "--cell", &sim_cell()]] {
             let (code, _, errors) = in_time(command, home.path());
             assert_eq!(code, 2, "{errors}");

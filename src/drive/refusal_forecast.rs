@@ -1,4 +1,5 @@
-//! Refusals that the nominal surface alone decides, foretold from a measurement that is computed before anything moves.
+//! Forecast of a refusal that the nominal surface alone decides, from a measurement that is computed before anything
+//! moves.
 
 use std::f64::consts::{SQRT_2, TAU};
 
@@ -19,12 +20,13 @@ const MAX_TARGETS: usize = 1200;
 const NOISE_SHARE: f64 = 0.05;
 
 /// Returns the reason why the first measurement of the part would end without a correction, in the words of the alarm
-/// of the cell. Returns `None` if nothing is foreseen.
+/// of the cell. Returns `None` if no refusal is expected.
 ///
-/// The measurement is computed: the targets of the plan on the nominal surface, with a random form error of the root
-/// mean square `rms_mm` after the best fit, with a correlation length as long as the part is large (root mean square distance of the
-/// targets from their centroid), and with noise. It is registered and judged as a measurement of a run is.
-pub fn foretell_refusal(task: &Task, rms_mm: f64) -> Option<String> {
+/// The measurement is computed: the targets of the plan on the nominal surface, with a random form error and with noise.
+/// The form error has the root mean square `rms_mm` after the best fit. Its correlation length is as long as the part is
+/// large (root mean square distance of the targets from their centroid). The measurement is registered and judged as one
+/// of a run is.
+pub fn forecast_refusal(task: &Task, rms_mm: f64) -> Option<String> {
     let every = task.targets.len().div_ceil(MAX_TARGETS).max(1);
     let targets: Vec<&Target> = task.targets.iter().step_by(every).collect();
     let places: Vec<Point> = targets.iter().map(|target| target.point).collect();
