@@ -153,7 +153,7 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
         probability: Tolerance::DEFAULT_PROBABILITY,
         pv_points: PvPoints::MostPoints,
     };
-    let adaptive = AdaptiveOptions { tolerance, accepted_risk: 0.025, max_cycles: 5 };
+    let adaptive = AdaptiveOptions { tolerance, accepted_risk: 0.025, max_measurements: 5 };
     let given = ModelInputs {
         decision_risk: adaptive.decision_risk(),
         probe_noise_mm: [SCATTER_MM, 0.15],

@@ -52,6 +52,21 @@ pub enum FirstStep {
     Measure,
 }
 
+impl FirstStep {
+    /// Returns the maximum number of cycles, and thus of measurements, of a run with at most `max_passes` passes. A run
+    /// that begins with a measurement has one cycle without a pass.
+    pub fn max_cycle_number(self, max_passes: u32) -> u32 {
+        max_passes.saturating_add(u32::from(self == Self::Measure))
+    }
+}
+
+impl CellPlan {
+    /// Returns the maximum number of cycles, and thus of measurements, see [`FirstStep::max_cycle_number`].
+    pub fn max_cycle_number(&self) -> u32 {
+        self.begin_with.max_cycle_number(self.max_cycles)
+    }
+}
+
 /// Accepted tolerance.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Tolerance {

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use data_encoding::HEXLOWER;
-use regrind::cell::{CellPlan, FirstStep};
+use regrind::cell::CellPlan;
 use regrind::compensation::path::{ArcSummary, PathSummary, Peak, Scallops, ToolPath};
 use regrind::config::{BUILT_IN_CELL, CellConfig};
 use regrind::drive::{Task, forecast_refusal};
@@ -293,7 +293,7 @@ impl Document {
         let first_um = 1e3 * task.correction_limits.allowance_mm;
         let grinding_minutes = path_mm / task.pass.feed_mm_min;
         let removed_mm3_a_pass = pass_mm * task.pass.track_spacing_mm * task.correction_limits.depth_of_cut_mm;
-        let max_measurements = plan.max_cycles + u32::from(plan.begin_with == FirstStep::Measure);
+        let max_measurements = plan.max_cycle_number();
         let min_measuring_minutes = min_measuring_minutes(task);
         let min_minutes = f64::from(plan.max_cycles) * grinding_minutes
             + f64::from(max_measurements) * min_measuring_minutes.unwrap_or(0.0);

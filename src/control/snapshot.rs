@@ -36,7 +36,7 @@ pub struct Snapshot {
     pub state_number: u64,
     /// Number of the cycle; 0 before the first.
     pub cycle: u32,
-    /// Maximum number of cycles.
+    /// Maximum number of the cycle. It is one more than the passes if the run begins with a measurement.
     #[serde(default)]
     pub max_cycles: u32,
     /// Time since the run began, in seconds.

@@ -55,7 +55,7 @@ pub(super) fn evaluate_touches(
         return TouchEvaluation { form: Err(reason.to_owned()), next: Some((short_tour(&places, first), reason)) };
     }
     let so_far = PartialMeasurement { targets: &places, tried: &tried, touched: &points.point_targets };
-    let purpose = adaptive.stopping_criteria(u32::from(cycle.correction.cycle) < adaptive.max_cycles);
+    let purpose = adaptive.stopping_criteria(u32::from(cycle.correction.cycle) < adaptive.max_measurements);
     let given = ModelInputs {
         decision_risk: adaptive.decision_risk(),
         acceptance_probability: adaptive.tolerance.probability,

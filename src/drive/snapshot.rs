@@ -38,7 +38,7 @@ impl Drive {
             verdict: PartVerdict::from_state(state.name()),
             state_number: self.display.state_changes,
             cycle: self.cell.cycle(),
-            max_cycles: self.cell.plan().max_cycles,
+            max_cycles: self.cell.plan().max_cycle_number(),
             elapsed_s: self.now().as_secs_f64(),
             progress: self.display.progress_estimator.progress(),
             preview: self.display.preview_statistics.statistics(),

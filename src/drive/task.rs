@@ -123,8 +123,8 @@ pub struct AdaptiveOptions {
     pub tolerance: Tolerance,
     /// Probability with which a part that is out of tolerance may be accepted.
     pub accepted_risk: f64,
-    /// Maximum number of passes of the grinder.
-    pub max_cycles: u32,
+    /// Maximum number of measurements of the part. After the last one no pass follows.
+    pub max_measurements: u32,
 }
 
 impl AdaptiveOptions {

@@ -6,7 +6,6 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::{Mutex, PoisonError};
-use std::time::SystemTime;
 
 use argon2::Argon2;
 use argon2::password_hash::phc::PasswordHash;
@@ -141,16 +140,11 @@ impl Users {
     /// # Errors
     /// A file that cannot be read, that other users of the computer can read, or that is not a valid list.
     pub fn read(path: &Path) -> Result<Self, UsersError> {
-        let failed = |source| UsersError::Unreadable { path: path.to_owned(), source };
-        let found = std::fs::metadata(path).map_err(failed)?;
-        let broken = |what: String| UsersError::Broken { path: path.to_owned(), what };
-        if !found.is_file() || found.len() > MAX_BYTES {
-            return Err(broken("the path is not a file, or the file is larger than 1 MiB".into()));
-        }
-        if let Some(open) = readable_by_others(path).map_err(failed)? {
-            return Err(UsersError::Open { path: path.to_owned(), open });
-        }
-        Self::parse(&std::fs::read_to_string(path).map_err(failed)?).map_err(broken)
+        Self::parse_from(path, &text_of(path)?)
+    }
+
+    fn parse_from(path: &Path, text: &str) -> Result<Self, UsersError> {
+        Self::parse(text).map_err(|what| UsersError::Broken { path: path.to_owned(), what })
     }
 
     fn parse(text: &str) -> Result<Self, String> {
@@ -237,14 +231,28 @@ fn named(name: &str) -> Result<String, UsersError> {
     if fits && misleading(name).is_none() { Ok(name.to_owned()) } else { Err(UsersError::Name) }
 }
 
-/// Time of the last change and length of a file; `None` if the file does not exist.
-type Stamp = Option<(SystemTime, u64)>;
+/// Reads the file of a list of users, if it is a file of at most [`MAX_BYTES`] that other users of the computer cannot
+/// read.
+fn text_of(path: &Path) -> Result<String, UsersError> {
+    let failed = |source| UsersError::Unreadable { path: path.to_owned(), source };
+    let found = std::fs::metadata(path).map_err(failed)?;
+    if !found.is_file() || found.len() > MAX_BYTES {
+        let what = "the path is not a file, or the file is larger than 1 MiB".into();
+        return Err(UsersError::Broken { path: path.to_owned(), what });
+    }
+    if let Some(open) = readable_by_others(path).map_err(failed)? {
+        return Err(UsersError::Open { path: path.to_owned(), open });
+    }
+    std::fs::read_to_string(path).map_err(failed)
+}
 
 /// List of users that is read again when its file changes. A person who is removed, or who gets another role or
 /// password, is signed out at once.
 pub struct UsersFile {
     path: PathBuf,
-    read: Mutex<(Stamp, Users)>,
+    /// Text of the file, and its users. The whole text is compared, not the time of the file: the clock of a file system
+    /// may give two changes one time.
+    read: Mutex<(String, Users)>,
 }
 
 impl UsersFile {
@@ -253,16 +261,18 @@ impl UsersFile {
     /// # Errors
     /// The same as for [`Users::read`].
     pub fn open(path: &Path) -> Result<Self, UsersError> {
-        let read = (changed(path), Users::read(path)?);
-        Ok(Self { path: path.to_owned(), read: Mutex::new(read) })
+        let text = text_of(path)?;
+        let users = Users::parse_from(path, &text)?;
+        Ok(Self { path: path.to_owned(), read: Mutex::new((text, users)) })
     }
 
-    /// Returns the list of users, read again if its file has changed. The list is empty if the file cannot be read.
+    /// Returns the list of users as the file has it now. The list is empty if the file cannot be read.
     fn now(&self) -> Users {
-        let at = changed(&self.path);
+        let Ok(text) = text_of(&self.path) else { return Users::default() };
         let mut read = self.read.lock().unwrap_or_else(PoisonError::into_inner);
-        if at.is_none() || read.0 != at {
-            *read = (at, Users::read(&self.path).unwrap_or_default());
+        if read.0 != text {
+            let users = Users::parse(&text).unwrap_or_default();
+            *read = (text, users);
         }
         read.1.clone()
     }
@@ -278,9 +288,4 @@ impl UsersFile {
     pub(crate) fn has(&self, AuthenticatedUser(was): &AuthenticatedUser) -> bool {
         self.now().users.contains(was)
     }
-}
-
-fn changed(path: &Path) -> Stamp {
-    let found = std::fs::metadata(path).ok()?;
-    Some((found.modified().ok()?, found.len()))
 }

@@ -74,7 +74,7 @@ pub(super) fn adaptive(recipe: &Recipe) -> Option<AdaptiveOptions> {
     Some(AdaptiveOptions {
         tolerance: tolerance(recipe),
         accepted_risk,
-        max_cycles: u32::from(recipe.cycle.max_cycles),
+        max_measurements: recipe.cycle.begin_with.max_cycle_number(u32::from(recipe.cycle.max_cycles)),
     })
 }
 

@@ -205,6 +205,15 @@ fn removed_user_is_signed_out() {
     let token = stays.token();
     let out = stays.post("/sign-out", &[("Origin", &stays.origin()), ("X-Regrind-Token", &token)], b"");
     assert_eq!((out.status, stays.get("/runs").status), (204, 401));
+    // A change that keeps the length and the time of the file is seen too.
+    let path = home.path().join("users.toml");
+    let changes = Visitor::signed_in(&url, "changes", "another 1234567").unwrap();
+    let written_at = std::fs::metadata(&path).unwrap().modified().unwrap();
+    let listed = std::fs::read_to_string(&path).unwrap();
+    std::fs::write(&path, listed.replace("\"operator\"", "\"engineer\"")).unwrap();
+    let file = std::fs::File::options().write(true).open(&path).unwrap();
+    file.set_modified(written_at).unwrap();
+    assert_eq!((changes.get("/runs").status, std::fs::metadata(&path).unwrap().len()), (401, listed.len() as u64));
     // If the list cannot be read, nobody has access.
     let stays = Visitor::signed_in(&url, "stays", PASSWORD).unwrap();
     std::fs::write(home.path().join("users.toml"), "broken").unwrap();

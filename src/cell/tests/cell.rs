@@ -240,6 +240,12 @@ fn run_begins_with_measurement() {
     run.start().run_to_rest();
     assert_eq!(run.starts(), [(Device::Cmm, 1)]);
     assert_eq!(run.cell.state(), State::Complete);
+    // Two allowed passes are three cycles: the first cycle has no pass.
+    let mut run =
+        TestRun::new(CellPlan { begin_with, max_cycles: 2, ..plan() }, |k| figures(40.0 - 8.0 * f64::from(k), 5.0));
+    run.start().run_to_rest();
+    assert_eq!(run.verdicts().last(), Some(&Verdict::MaxCycles));
+    assert_eq!((run.cell.cycle(), run.cell.plan().max_cycle_number()), (3, 3));
 }
 
 #[test]

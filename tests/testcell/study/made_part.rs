@@ -159,7 +159,7 @@ impl Line<'_> {
     fn chosen(&self, level_mm: f64, seed: u64, cycle: u32) -> Took {
         let targets: &[(Point, Vector)] = &self.bench.plan_of;
         let (tolerance, max_cycles) = (self.bench.plan.tolerance, self.bench.plan.max_cycles);
-        let adaptive = AdaptiveOptions { tolerance, accepted_risk: 0.025, max_cycles };
+        let adaptive = AdaptiveOptions { tolerance, accepted_risk: 0.025, max_measurements: max_cycles };
         let purpose = adaptive.stopping_criteria(cycle < max_cycles);
         let given = ModelInputs { decision_risk: adaptive.decision_risk(), ..self.given() };
         let mut tried = vec![None; targets.len()];
