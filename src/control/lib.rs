@@ -10,12 +10,14 @@
 //! identifies the user of the client. A program that acts for other people names the person.
 
 mod endpoint;
+mod machine_status;
 mod request;
 mod snapshot;
 mod socket;
 
 pub use regrind_cell::CycleRow;
 
+pub use machine_status::{MachineStatus, MachineValue, ValueKind};
 pub use request::{OnBehalf, PreliminaryTouches, Reply, Request};
 pub use snapshot::{JobProgress, NextStep, PartVerdict, PreviewStatistics, Snapshot};
 pub use socket::{

@@ -6,6 +6,7 @@ use regrind_cell::{AlarmId, Device};
 use regrind_document::misleading;
 use serde::{Deserialize, Serialize};
 
+use super::machine_status::MachineStatus;
 use super::snapshot::Snapshot;
 
 /// Request to a running cell: the order, with the machine that it concerns and a reason, which can be empty.
@@ -84,6 +85,8 @@ pub enum Request {
         #[serde(default)]
         from: u32,
     },
+    /// Request for the status of both machines with the courses of their values.
+    Machines,
     /// Request for the state of the cell once.
     Status,
     /// Request for the state of the cell now and after every change, until either end closes the connection.
@@ -104,12 +107,15 @@ pub struct Reply {
     /// Answer to [`Request::Touches`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub touches: Option<PreliminaryTouches>,
+    /// Answer to [`Request::Machines`]: the measuring machine and the grinder.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub machines: Option<[MachineStatus; 2]>,
 }
 
 impl Reply {
-    /// Returns a reply without touches.
+    /// Returns a reply without touches and machines.
     pub fn new(accepted: bool, message: String, status: Snapshot) -> Self {
-        Self { accepted, message, status, touches: None }
+        Self { accepted, message, status, touches: None, machines: None }
     }
 }
 

@@ -488,7 +488,7 @@ pub struct Status {
 
 impl Status {
     /// Returns a status that contains only the state of the machine; all other values are unknown.
-    pub(super) fn from_state(state: MachineState) -> Self {
+    pub fn from_state(state: MachineState) -> Self {
         Self {
             state,
             job: None,

@@ -5,6 +5,7 @@ use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 
+use super::machine_monitor::MachineMonitor;
 use super::station::{
     AbortCounter, CmmDriver, GrinderDriver, LoopWatchdog, MachineTask, StationDriver, StationReport, StationRequest,
 };
@@ -28,6 +29,8 @@ pub(super) struct Machines {
     pub(super) notes: [Vec<String>; 2],
     /// Step that each machine asks of a person.
     pub(super) steps: [Option<OperatorStep>; 2],
+    /// Last status of each machine and the courses of its values.
+    pub(super) monitors: [MachineMonitor; 2],
     tasks: [JoinHandle<()>; 2],
 }
 
@@ -50,7 +53,8 @@ impl Machines {
         let abort_counts = [watch::Sender::new(0), watch::Sender::new(0)];
         let watchdog = LoopWatchdog::new();
         let [of_cmm, of_grinder] = earlier;
-        let of = |k: usize| (&interrupts[k], &abort_counts[k], &watchdog);
+        let monitors = Device::BOTH.map(MachineMonitor::new);
+        let of = |k: usize| (&interrupts[k], &abort_counts[k], &watchdog, &monitors[k]);
         let (to_cmm, cmm) = spawn_station(CmmDriver(cmm), job, of(0), &reports, of_cmm, poll[0]);
         let (to_grinder, grinder) = spawn_station(GrinderDriver(grinder), job, of(1), &reports, of_grinder, poll[1]);
         Self {
@@ -62,6 +66,7 @@ impl Machines {
             prepared,
             notes: [Vec::new(), Vec::new()],
             steps: [None, None],
+            monitors,
             tasks: [cmm, grinder],
         }
     }
@@ -97,13 +102,13 @@ impl Machines {
 fn spawn_station<D: StationDriver>(
     driver: D,
     job: u32,
-    (interrupt, aborts, pulse): (&Interrupt, &watch::Sender<u64>, &LoopWatchdog),
+    (interrupt, aborts, pulse, monitor): (&Interrupt, &watch::Sender<u64>, &LoopWatchdog, &MachineMonitor),
     reports: &mpsc::Sender<StationReport>,
     (armed, may_be_at_work): (Option<(u32, Armed)>, bool),
     poll: Duration,
 ) -> (mpsc::Sender<StationRequest>, tokio::task::JoinHandle<()>) {
     let (asks, asked) = mpsc::channel(16);
-    let station = MachineTask::new(driver, job, interrupt.clone(), reports.clone(), armed);
+    let station = MachineTask::new(driver, job, (interrupt.clone(), monitor.clone()), reports.clone(), armed);
     let station = if may_be_at_work { station.restore_preparation() } else { station };
     (asks, tokio::spawn(station.serve(asked, poll, AbortCounter::new(aborts.subscribe()), pulse.clone())))
 }

@@ -23,6 +23,7 @@ mod display;
 mod evaluation;
 mod execute;
 mod failure;
+mod machine_monitor;
 mod machine_reports;
 mod machines;
 mod notice;

@@ -5,6 +5,7 @@ use regrind_control::{ReceivedOrder, Reply, Request};
 use tokio::sync::oneshot;
 
 use super::Drive;
+use super::machine_monitor::MachineMonitor;
 use super::record_queue::RecordAction;
 use crate::cell::{Actor, AlarmId, Device, Event, Phase};
 use crate::device::{Identified, OperatorConfirmation};
@@ -48,6 +49,13 @@ impl Drive {
                 let touches = Some(self.display.preview_statistics.touches_from(from));
                 if let Some(answer) = answer {
                     drop(answer.send(Reply { touches, ..Reply::new(true, String::new(), self.snapshot()) }));
+                }
+                return;
+            }
+            Request::Machines => {
+                let machines = Some(self.machines.monitors.each_ref().map(MachineMonitor::status));
+                if let Some(answer) = answer {
+                    drop(answer.send(Reply { machines, ..Reply::new(true, String::new(), self.snapshot()) }));
                 }
                 return;
             }

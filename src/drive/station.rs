@@ -18,9 +18,10 @@ mod translation;
 use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot};
-use tokio::time::{MissedTickBehavior, interval};
+use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use super::failure::panic_message;
+use super::machine_monitor::MachineMonitor;
 use crate::cell::{Command, Device, Event};
 use crate::device::{Armed, BatchId, Interrupt, Machine as _, OperatorConfirmation, PreliminaryPoints};
 use crate::formats::operator_step::OperatorStep;
@@ -80,6 +81,7 @@ pub(super) struct MachineTask<B> {
     /// Cycle of the job that runs.
     cycle: u32,
     observed: ObservedState,
+    monitor: MachineMonitor,
     /// Notes that were last reported to a person.
     reported_notes: Vec<String>,
     /// Step of a person that was last reported.
@@ -93,7 +95,7 @@ impl<B: StationDriver> MachineTask<B> {
     pub(super) fn new(
         driver: B,
         job: u32,
-        interrupt: Interrupt,
+        (interrupt, monitor): (Interrupt, MachineMonitor),
         reports: mpsc::Sender<StationReport>,
         intent: Option<(u32, Armed)>,
     ) -> Self {
@@ -108,6 +110,7 @@ impl<B: StationDriver> MachineTask<B> {
             armed,
             cycle,
             observed: seen,
+            monitor,
             reported_notes: notes,
             reported_step: None,
         }
@@ -218,8 +221,10 @@ impl<B: StationDriver> MachineTask<B> {
         if self.observed.link_lost {
             return self.reconnect().await;
         }
+        let asked_at = Instant::now();
         match self.driver.machine().status().await {
             Ok(status) => {
+                self.monitor.add_status(self.driver.machine().name(), &status, asked_at.elapsed());
                 self.report_notes().await;
                 self.report_changes(&status).await;
                 self.read_ahead().await;

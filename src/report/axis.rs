@@ -55,11 +55,28 @@ impl Ruler {
         Self { range, ..self }
     }
 
+    /// Returns the first and the last coordinate.
+    pub(super) fn range(&self) -> [f64; 2] {
+        match self.scale {
+            Scale::Linear => self.range,
+            Scale::Log => self.range.map(|power| 10f64.powf(power)),
+        }
+    }
+
     /// Returns the position of a coordinate, in pixels.
     pub(super) fn pixel(&self, value: f64) -> f64 {
         let value = if self.scale == Scale::Log { value.log10() } else { value };
         let t = (value - self.range[0]) / (self.range[1] - self.range[0]);
         self.pixels[0] + t * (self.pixels[1] - self.pixels[0])
+    }
+
+    /// Returns the round numbers within the range of a linear axis, at most `most` steps, each with the decimals that the
+    /// step needs. The decimals are `None` if the numbers need an exponent.
+    pub(super) fn round_coordinates(&self, most: usize) -> Vec<(f64, Option<usize>)> {
+        let [low, high] = self.range;
+        let step = nice_step(high - low, most);
+        let decimals = (1e-4..1e6).contains(&step).then(|| (-(step.log10() + 1e-9).floor()).max(0.0) as usize);
+        round_numbers(low, high, step).map(|value| (value, decimals)).collect()
     }
 
     /// Returns the ticks at round numbers within the range of the axis. On a logarithmic axis these are powers of ten.
@@ -105,7 +122,7 @@ fn round_numbers(low: f64, high: f64, step: f64) -> impl Iterator<Item = f64> {
 /// Returns the label of the tick at `value`. `step` is the distance between ticks, and `value` is a multiple of `step`.
 /// The label has as many decimals as `step` needs. If `step` is below 1e-4, or is 1e6 or more, the label has one digit
 /// and an exponent, such as "2e−7". The label of 0 is always "0".
-fn label(value: f64, step: f64) -> String {
+pub(super) fn label(value: f64, step: f64) -> String {
     if value == 0.0 {
         return "0".into();
     }
@@ -113,6 +130,11 @@ fn label(value: f64, step: f64) -> String {
         return format!("{value:.0e}").replace('-', "\u{2212}");
     }
     let decimals = (-(step.log10() + 1e-9).floor()).max(0.0) as usize;
+    format!("{value:.decimals$}").replace('-', "\u{2212}")
+}
+
+/// Formats a number with a number of decimals and a true minus sign.
+pub(super) fn fixed(value: f64, decimals: usize) -> String {
     format!("{value:.decimals$}").replace('-', "\u{2212}")
 }
 

@@ -15,6 +15,7 @@
 //! x and y of the model frame {M}, with y upwards. Units: axes in millimetres, deviations in micrometres or nanometres.
 
 mod axis;
+mod chart;
 mod colour;
 mod convergence;
 mod dfq;
@@ -41,6 +42,7 @@ mod xml;
 use std::path::Path;
 
 pub use axis::Scale;
+pub use chart::{Chart, ChartAxis, Dot, Layer, Mark, NumberFormat, Shape};
 pub use colour::ColourMap;
 pub use dfq::{DfqPart, dfq_of_parts};
 pub use heat_map::HeatMap;

@@ -98,7 +98,7 @@ pub(super) fn maps(story: &RunHistory, folder: &Path) -> Result<String, ReportEr
     }
     html += &last.figure(last.max_magnitude_um(), ALONE, "on its own scale")?;
     let heading = format!("Cycle {}, {}", last.cycle, last.part);
-    let spread = histogram(&shortened(&heading, 460.0, 8.5), &last.samples_um)?;
+    let spread = histogram(&shortened(&heading, 460.0, 8.5), &last.samples_um);
     let _ = writeln!(html, "<figure>{}</figure>", within_html(&spread));
     let _ = writeln!(
         html,

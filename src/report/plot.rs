@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use super::ReportError;
-use super::axis::{Ruler, Scale};
-use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
+use super::axis::{Ruler, Scale, fixed};
+use super::chart::{Chart, ChartAxis, Dot, Layer, Mark, Shape};
 use regrind_formats::write_atomic;
 
 /// Axis of a plot.
@@ -38,12 +38,10 @@ pub struct Plot {
     pub series: Vec<Series>,
 }
 
-/// Okabe and Ito's colours, which people with colour blindness can distinguish. Their yellow is left out because its
-/// contrast on white is too low.
-const COLOURS: [&str; 7] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000"];
-
-const CORNER: [f64; 2] = [70.0, 44.0];
-const SIZE: [f64; 2] = [520.0, 340.0];
+/// Number of colours; the lines after them are dashed.
+const COLOURS: usize = 7;
+/// Width and height of the plot in pixels, without the names in the legend.
+const SIZE: [f64; 2] = [660.0, 440.0];
 
 impl Plot {
     /// Returns the plot as SVG.
@@ -51,28 +49,21 @@ impl Plot {
     /// # Errors
     /// Fails if there are no points, if a number is not finite, or if a number on a logarithmic axis is not above 0.
     pub fn to_svg(&self) -> Result<String, ReportError> {
-        let [x, y] = [self.ruler(0)?, self.ruler(1)?];
+        let [x, y] = [self.axis(0)?, self.axis(1)?];
         let longest = self.series.iter().map(|s| s.name.chars().count()).max().unwrap_or(0);
-        let [right, bottom] = [CORNER[0] + SIZE[0], CORNER[1] + SIZE[1]];
-        let mut svg = Svg::new(right + 56.0 + 6.6 * longest as f64, bottom + 54.0);
-        svg.text([CORNER[0], 24.0], Anchor::Start, LARGE, &self.title);
-        svg.frame(&Frame {
-            corner: CORNER,
-            size: SIZE,
-            x_ticks: x.ticks(self.max_x_ticks()),
-            y_ticks: y.ticks(8),
-            x_label: &self.x.label,
-            y_label: &self.y.label,
-            grid: true,
-        });
-        for (k, series) in self.series.iter().enumerate() {
-            let pixels: Vec<[f64; 2]> = series.points.iter().map(|p| [x.pixel(p[0]), y.pixel(p[1])]).collect();
-            draw(&mut svg, k, &pixels);
-            let row = CORNER[1] + 12.0 + 20.0 * k as f64;
-            draw(&mut svg, k, &[[right + 14.0, row], [right + 40.0, row]]);
-            svg.text([right + 48.0, row + 4.0], Anchor::Start, SMALL, &series.name);
-        }
-        Ok(svg.finish())
+        let right_margin = 56.0 + 6.6 * longest as f64;
+        let layers = self.series.iter().enumerate().map(|(k, series)| layer(k, series)).collect();
+        let chart = Chart {
+            title: self.title.clone(),
+            size: [SIZE[0] + right_margin, SIZE[1]],
+            right_margin,
+            x,
+            y,
+            layers,
+            has_legend: true,
+            ..Chart::default()
+        };
+        Ok(chart.to_file())
     }
 
     /// Saves the plot as an SVG file at `path`.
@@ -84,21 +75,12 @@ impl Plot {
         Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
     }
 
-    /// Returns the maximum number of ticks of the x axis. The number is 10, or less if all x values of the plot are
-    /// integers. In that case it is the difference between the largest and the smallest x, limited to 1 to 10.
-    fn max_x_ticks(&self) -> usize {
-        const MAX: usize = 10;
-        let all = || self.series.iter().flat_map(|series| &series.points).map(|point| point[0]);
-        let [low, high] = super::range(all());
-        if all().all(|x| x.fract() == 0.0) { ((high - low) as usize).clamp(1, MAX) } else { MAX }
-    }
-
-    /// Returns the mapping from plot coordinates to pixels for one axis: the x axis for `k` = 0, the y axis for `k` =
-    /// 1. The range of the axis contains the points of all series. It is widened to begin and end at a tick.
+    /// Returns one axis of the plot: the x axis for `k` = 0, the y axis for `k` = 1. Its range contains the points of all
+    /// series. It is widened to begin and end at a tick.
     ///
     /// # Errors
     /// Fails if there are no points, if a number is not finite, or if a number on a logarithmic axis is not above 0.
-    fn ruler(&self, k: usize) -> Result<Ruler, ReportError> {
+    fn axis(&self, k: usize) -> Result<ChartAxis, ReportError> {
         let (axis, what) = if k == 0 { (&self.x, "x") } else { (&self.y, "y") };
         let [mut low, mut high] = [f64::INFINITY, f64::NEG_INFINITY];
         for series in &self.series {
@@ -116,19 +98,31 @@ impl Plot {
         if low > high {
             return Err(ReportError::TooFewPoints { figure: self.title.clone(), found: 0, least: 1 });
         }
-        let pixels = if k == 0 { [CORNER[0], CORNER[0] + SIZE[0]] } else { [CORNER[1] + SIZE[1], CORNER[1]] };
-        Ok(Ruler::new(axis.scale, [low, high], pixels).rounded(8))
+        let ticks = if k == 0 { self.max_x_ticks(high - low) } else { 8 };
+        let range = Ruler::new(axis.scale, [low, high], [0.0, 1.0]).rounded(8).range();
+        Ok(ChartAxis::new(&axis.label, axis.scale, range, ticks, &fixed))
+    }
+
+    /// Returns the maximum number of ticks of the x axis. The number is 10, or less if all x values of the plot are
+    /// integers. In that case it is the `extent` of the values, limited to 1 to 10.
+    fn max_x_ticks(&self, extent: f64) -> usize {
+        const MAX: usize = 10;
+        let mut all = self.series.iter().flat_map(|series| &series.points).map(|point| point[0]);
+        if all.all(|x| x.fract() == 0.0) { (extent as usize).clamp(1, MAX) } else { MAX }
     }
 }
 
-/// Draws a line through `pixels`, with a marker at each point. `k` is the index of the series; it selects colour,
-/// marker and dashes.
-fn draw(svg: &mut Svg, k: usize, pixels: &[[f64; 2]]) {
-    let colour = COLOURS[k % COLOURS.len()];
-    let dashes = if k < COLOURS.len() { "none" } else { "6 3" };
-    svg.polyline(pixels, colour, dashes);
-    for &pixel in pixels {
-        svg.marker(pixel, k % 4, colour);
+/// Returns the marks of the line with the index `k`: its points, joined, each with the marker of the line.
+fn layer(k: usize, series: &Series) -> Layer {
+    const SHAPES: [Shape; 4] = [Shape::Disc, Shape::Square, Shape::Triangle, Shape::Diamond];
+    let points = series.points.clone();
+    let dot = |at: &[f64; 2]| Mark::Dot(Dot { at: *at, shape: SHAPES[k % SHAPES.len()], ..Dot::default() });
+    let dots: Vec<Mark> = points.iter().map(dot).collect();
+    let line = if k < COLOURS { Mark::Line(points) } else { Mark::Dashes(points) };
+    Layer {
+        name: series.name.clone(),
+        class: format!("s{}", k % COLOURS),
+        marks: std::iter::once(line).chain(dots).collect(),
     }
 }
 
@@ -146,7 +140,7 @@ mod tests {
     fn plot_svg_shows_every_line() {
         let svg = plot(vec![[0.0, 1e4], [1.0, 1.0], [2.0, 1e-18]]).to_svg().unwrap();
         let document = roxmltree::Document::parse(&svg).unwrap();
-        assert_eq!(document.descendants().filter(|n| n.has_tag_name("polyline")).count(), 18);
+        assert_eq!(document.descendants().filter(|n| n.has_tag_name("polyline")).count(), 9);
         let texts: Vec<_> = document.descendants().filter_map(|n| n.text()).collect();
         for text in ["case <8>", "objective / mm²", "iteration", "a plot"] {
             assert!(texts.contains(&text), "{text} is not in {texts:?}");

@@ -129,19 +129,6 @@ impl Svg {
         ));
     }
 
-    /// Draws a marker centred at `[x, y]`. `shape` is 0 for a disc, 1 for a square, 2 for a triangle, 3 for a diamond.
-    pub(super) fn marker(&mut self, [x, y]: [f64; 2], shape: usize, colour: &str) {
-        if shape == 0 {
-            return self.put(format_args!("<circle cx=\"{x:.2}\" cy=\"{y:.2}\" r=\"3.5\" fill=\"{colour}\"/>\n"));
-        }
-        let outline = match shape {
-            1 => "m-3.2,-3.2h6.4v6.4h-6.4z",
-            2 => "m0,-4.4l4.2,7.4h-8.4z",
-            _ => "m0,-4.6l4,4.6l-4,4.6l-4,-4.6z",
-        };
-        self.put(format_args!("<path d=\"M{x:.2},{y:.2}{outline}\" fill=\"{colour}\"/>\n"));
-    }
-
     /// Draws a rectangle around the plotting area, the ticks of the x axis below it and the ticks of the y axis on its
     /// left, with their labels, and the labels of both axes. If `frame.grid` is true, grid lines cross the rectangle at
     /// the ticks.
@@ -225,7 +212,6 @@ mod tests {
         svg.text([1.0, 2.0], Anchor::End, SMALL, odd);
         svg.upright([3.0, 4.0], odd);
         svg.gradient("g", &[(0.0, [0; 3]), (1.0, [255; 3])]);
-        (0..4).for_each(|shape| svg.marker([5.0, 5.0], shape, INK));
         svg.tick_label([0.0, 0.0], Anchor::Start, &Tick { pixel: 0.0, label: "10".into(), exponent: Some(-3) });
         let text = svg.finish();
         let document = roxmltree::Document::parse(&text).unwrap();

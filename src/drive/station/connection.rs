@@ -93,6 +93,7 @@ impl<B: StationDriver> MachineTask<B> {
 
     pub(super) async fn report_link_lost(&mut self, error: &DeviceError) {
         if !std::mem::replace(&mut self.observed.link_lost, true) {
+            self.monitor.add_lost_link();
             if self.observed.reconnected_at.is_none_or(|back| back.elapsed() > STABLE_LINK_TIME) {
                 self.observed.attempts = 0;
             } else {

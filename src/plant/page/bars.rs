@@ -1,12 +1,10 @@
 //! Bars of parts per day: accepted at the first measurement, accepted after a correction, and not accepted.
 
-use maud::{Markup, html};
+use maud::{Markup, PreEscaped, html};
+use regrind_report::{Chart, ChartAxis, Layer, Mark, Scale};
 
-const WIDTH: f64 = 640.0;
-const HEIGHT: f64 = 190.0;
-const LEFT: f64 = 40.0;
-const TOP: f64 = 14.0;
-const BOTTOM: f64 = 24.0;
+/// Width and height of the chart in pixels.
+const SIZE: [f64; 2] = [640.0, 190.0];
 
 /// Counts of one day.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -28,39 +26,38 @@ pub(super) struct Count {
 /// Draws a bar for each day, with the numbers of parts that were accepted at the first measurement, accepted later, and
 /// not accepted.
 pub(super) fn bars(days: &[Day]) -> Markup {
-    let most = days.iter().map(|day| day.count.ended).max().unwrap_or(0).max(1);
-    let step = (super::control_chart::round_step(most as f64 / 4.0) as i64).max(1);
-    let y = |count: i64| HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * count as f64 / (1.08 * most as f64);
-    let wide = (WIDTH - LEFT) / days.len().max(1) as f64;
-    let bar = |k: usize, class: &str, from: i64, to: i64| {
-        let (x, height) = (LEFT + wide * (k as f64 + 0.15), y(from) - y(to));
-        html! {
-            @if to > from {
-                rect .(class) x=(format!("{x:.1}")) width=(format!("{:.1}", 0.7 * wide)) y=(format!("{:.1}", y(to))) height=(format!("{height:.1}")) {}
-            }
-        }
-    };
+    let most = days.iter().map(|day| day.count.ended).max().unwrap_or(0).max(1) as f64;
     let told = |day: &Day| {
         let Count { ended, accepted, at_once } = day.count;
         format!("{}: {ended} ended, {accepted} accepted, {at_once} at the first measurement", day.day)
     };
+    let marks = days.iter().enumerate().flat_map(|(k, day)| {
+        let (Count { ended, accepted, at_once }, x) = (day.count, k as f64);
+        let bar = move |(class, from, to): (&'static str, i64, i64)| {
+            let (x, y) = ([x - 0.35, x + 0.35], [from as f64, to as f64]);
+            (to > from).then(|| Mark::Bar { class, fill: None, x, y, tooltip: told(day) })
+        };
+        let parts = [("at-once", 0, at_once), ("accepted", at_once, accepted), ("other", accepted, ended)];
+        let count = (ended > 0).then(|| Mark::Text { at: [x, ended as f64 + 0.02 * most], text: ended.to_string() });
+        parts.into_iter().filter_map(bar).chain(count).collect::<Vec<_>>()
+    });
+    let last = days.len().saturating_sub(1);
+    let dated = days.iter().enumerate().filter(|(k, _)| (last - k).is_multiple_of(2));
+    let number = |value: f64, _: usize| format!("{value:.0}");
+    let chart = Chart {
+        description: days.iter().map(told).collect::<Vec<_>>().join("; "),
+        size: SIZE,
+        x: ChartAxis {
+            range: [-0.5, last as f64 + 0.5],
+            ticks: dated.map(|(k, day)| (k as f64, day.day.clone())).collect(),
+            ..ChartAxis::default()
+        },
+        y: ChartAxis::new("", Scale::Linear, [0.0, 1.12 * most], most.clamp(2.0, 4.0) as usize, &number),
+        layers: vec![Layer { class: "bars".into(), marks: marks.collect(), ..Layer::default() }],
+        ..Chart::default()
+    };
     html! {
-        svg .chart .bars viewBox=(format!("0 0 {WIDTH} {HEIGHT}")) role="img" aria-label=(days.iter().map(told).collect::<Vec<_>>().join("; ")) {
-            @for tick in (0..=most).step_by(usize::try_from(step).unwrap_or(1)) {
-                @let at = format!("{:.1}", y(tick));
-                line .grid x1=(LEFT) x2=(WIDTH) y1=(at) y2=(at) {}
-                text .tick x=(LEFT - 6.0) y=(at) dy="4" text-anchor="end" { (tick) }
-            }
-            @for (k, day) in days.iter().enumerate() {
-                @let Count { ended, accepted, at_once } = day.count;
-                g {
-                    title { (told(day)) }
-                    (bar(k, "at-once", 0, at_once)) (bar(k, "accepted", at_once, accepted)) (bar(k, "other", accepted, ended))
-                    @if ended > 0 { text .count x=(format!("{:.1}", LEFT + wide * (k as f64 + 0.5))) y=(format!("{:.1}", y(ended) - 3.0)) text-anchor="middle" { (ended) } }
-                }
-                @if (days.len() - 1 - k).is_multiple_of(2) { text .tick x=(format!("{:.1}", LEFT + wide * (k as f64 + 0.5))) y=(HEIGHT - 6.0) text-anchor="middle" { (day.day) } }
-            }
-        }
+        (PreEscaped(chart.to_markup()))
         p .legend {
             span .key .at-once {} " accepted at the first measurement " span .key .accepted {} " accepted after corrections "
             span .key .other {} " not accepted, stopped or aborted"

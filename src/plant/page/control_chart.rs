@@ -5,7 +5,8 @@
 //! x, the limits are at 2.660 mean MR from the centre (3 / d2, d2 = 1.128 for two values), and a range is out of
 //! control above 3.267 mean MR (D4). Units: micrometres.
 
-use maud::{Markup, html};
+use maud::{Markup, PreEscaped};
+use regrind_report::{Chart, ChartAxis, Dot, Layer, Mark, Scale, Shape};
 
 use super::words::shown;
 
@@ -15,11 +16,9 @@ const D4: f64 = 3.267;
 /// Minimum number of values for limits. Limits of fewer values change much with the next values.
 pub(super) const ENOUGH: usize = 20;
 
+/// Width of a chart and the space to the right of its axes, in pixels.
 const WIDTH: f64 = 900.0;
-const LEFT: f64 = 52.0;
-const RIGHT: f64 = 120.0;
-const TOP: f64 = 12.0;
-const BOTTOM: f64 = 26.0;
+const RIGHT: f64 = 130.0;
 
 /// Figure of a part.
 #[derive(Clone, Debug)]
@@ -76,11 +75,9 @@ pub(super) fn ranges(values: &[f64]) -> Vec<f64> {
     values.windows(2).map(|pair| (pair[1] - pair[0]).abs()).collect()
 }
 
-/// Horizontal line of a chart, with its name.
-struct Across {
-    class: &'static str,
-    name: &'static str,
-    at: f64,
+/// Returns a horizontal line of a chart, with its name and its value.
+fn across(class: &'static str, name: &str, at: f64) -> Mark {
+    Mark::Across { class, name: format!("{name} {at:.2}"), at }
 }
 
 /// Draws the control chart of individual values in µm as SVG. `values` are the parts in the order of measurement; each
@@ -90,21 +87,20 @@ struct Across {
 /// line between them.
 pub(super) fn individuals(name: &str, class: &str, values: &[Value], limits: &Limits) -> Markup {
     let all: Vec<f64> = values.iter().map(|value| value.um).collect();
-    let mut lines = vec![
-        Across { class: "centre", name: "mean", at: limits.mean },
-        Across { class: "control", name: "upper limit", at: limits.upper },
-    ];
-    lines.extend(limits.lower.map(|at| Across { class: "control", name: "lower limit", at }));
+    let mut marks = vec![across("centre", "mean", limits.mean), across("control", "upper limit", limits.upper)];
+    marks.extend(limits.lower.map(|at| across("control", "lower limit", at)));
     let most = all.iter().fold(limits.upper, |most, value| most.max(*value));
     // A tolerance far above all values would flatten the chart, so it is not drawn.
     let tolerance = values.iter().filter_map(|value| value.limit_um).fold(0.0, f64::max);
     let shows = tolerance > 0.0 && tolerance < 4.0 * most;
-    let scale = Scale { max: if shows { most.max(tolerance) } else { most }, count: values.len(), height: 280.0 };
-    let steps = if shows { tolerance_line(values, &scale) } else { Vec::new() };
-    // The label is next to the end of the line; the line itself is stepped.
-    let last = values.last().and_then(|value| value.limit_um).filter(|_| shows);
-    lines.extend(last.map(|at| Across { class: "allowed", name: "allowed", at }));
-    drawn(&format!("{name}, µm"), class, values, &all, &lines, &scale, |value| limits.is_out(value), &steps)
+    if shows {
+        marks.extend(tolerance_lines(values));
+        // The label is next to the end of the line; the line itself is stepped.
+        marks.extend(values.last().and_then(|value| value.limit_um).map(|at| across("allowed", "allowed", at)));
+    }
+    let (most, title) = (if shows { most.max(tolerance) } else { most }, format!("{name}, µm"));
+    let layers = [Layer { marks, ..Layer::default() }, of_values(class, values, &all, |value| limits.is_out(value))];
+    drawn((title, 300.0), values, most, layers)
 }
 
 /// Draws the control chart of the moving ranges in µm as SVG. A moving range is the absolute difference of two
@@ -114,151 +110,85 @@ pub(super) fn individuals(name: &str, class: &str, values: &[Value], limits: &Li
 pub(super) fn moving_ranges(name: &str, class: &str, values: &[Value], limits: &Limits) -> Markup {
     let all: Vec<f64> = values.iter().map(|value| value.um).collect();
     let all = ranges(&all);
-    let lines = [
-        Across { class: "centre", name: "mean range", at: limits.mean_range },
-        Across { class: "control", name: "upper limit", at: limits.range_upper },
-    ];
+    let marks =
+        vec![across("centre", "mean range", limits.mean_range), across("control", "upper limit", limits.range_upper)];
     let most = all.iter().fold(limits.range_upper, |most, value| most.max(*value));
-    let scale = Scale { max: most, count: values.len(), height: 150.0 };
-    let is_out = |value| value > limits.range_upper;
-    drawn(&format!("Moving range of {name}, µm"), class, &values[1..], &all, &lines, &scale, is_out, &[])
+    let of_ranges = of_values(class, values, &all, |value| value > limits.range_upper);
+    let title = format!("Moving range of {name}, µm");
+    drawn((title, 170.0), values, most, [Layer { marks, ..Layer::default() }, of_ranges])
 }
 
-/// Returns the tolerances of the parts as stepped lines, in pixels of the drawing. Each text is one line, in the format
-/// of the `points` attribute of an SVG polyline. A part without a tolerance ends the line, and the next part with a
-/// tolerance begins a new line.
-fn tolerance_line(values: &[Value], scale: &Scale) -> Vec<String> {
-    let half = 0.5 * (scale.x(1) - scale.x(0));
-    let mut parts: Vec<String> = vec![String::new()];
-    for (k, value) in values.iter().enumerate() {
-        let Some(limit) = value.limit_um else {
-            parts.push(String::new());
-            continue;
-        };
-        let (x, y) = (scale.x(k), scale.y(limit));
-        if let Some(part) = parts.last_mut() {
-            *part += &format!("{:.1},{y:.1} {:.1},{y:.1} ", x - half, x + half);
-        }
-    }
-    parts.retain(|part| !part.is_empty());
-    parts
+/// Returns the tolerances of the parts as stepped lines. A part without a tolerance ends a line, and the next part with
+/// a tolerance begins a new one.
+fn tolerance_lines(values: &[Value]) -> Vec<Mark> {
+    let steps = values.iter().enumerate().collect::<Vec<_>>();
+    let lines = steps.split(|(_, value)| value.limit_um.is_none()).filter(|line| !line.is_empty());
+    let step = |(k, value): &(usize, &Value)| {
+        let (x, y) = (*k as f64, value.limit_um.unwrap_or_default());
+        [[x - 0.5, y], [x + 0.5, y]]
+    };
+    lines.map(|line| Mark::Steps(line.iter().flat_map(step).collect())).collect()
 }
 
-#[expect(clippy::too_many_arguments, reason = "each is one thing that the chart shows")]
-fn drawn(
-    title: &str,
-    class: &str,
-    values: &[Value],
-    all: &[f64],
-    lines: &[Across],
-    scale: &Scale,
-    is_out: impl Fn(f64) -> bool,
-    steps: &[String],
-) -> Markup {
+/// Returns the points of the figures `all`, in µm, and the line between them. The last figure belongs to the last of
+/// `values`. `is_out` decides which points call for attention.
+fn of_values(class: &str, values: &[Value], all: &[f64], is_out: impl Fn(f64) -> bool) -> Layer {
     // The first range belongs to the second value.
-    let offset = scale.count - values.len();
-    let at = |k: usize| (scale.x(k + offset), scale.y(all[k]));
-    let line: String = (0..all.len()).map(|k| format!("{:.1},{:.1} ", at(k).0, at(k).1)).collect();
-    let right = WIDTH - RIGHT;
-    let labels = apart(lines.iter().map(|line| scale.y(line.at)).collect());
-    html! {
-        svg .chart viewBox=(format!("0 0 {WIDTH} {}", scale.height)) role="img" aria-label=(title) {
-            text .title x=(LEFT) y=(TOP) { (title) }
-            @for tick in scale.ticks() {
-                @let y = format!("{:.1}", scale.y(tick));
-                line .grid x1=(LEFT) x2=(right) y1=(y) y2=(y) {}
-                text .tick x=(LEFT - 6.0) y=(y) dy="4" text-anchor="end" { (tick) }
-            }
-            @for k in scale.marked().into_iter().filter(|k| *k >= offset) {
-                text .tick x=(format!("{:.1}", scale.x(k))) y=(scale.height - 6.0) text-anchor="middle" { (values[k - offset].when.get(..10).unwrap_or_default()) }
-            }
-            @for step in steps { polyline .tolerance points=(step) {} }
-            @for (across, label) in lines.iter().zip(labels) {
-                @let y = format!("{:.1}", scale.y(across.at));
-                line .(across.class) x1=(LEFT) x2=(right) y1=(y) y2=(y) {}
-                text .(across.class) x=(right + 5.0) y=(format!("{label:.1}")) dy="4" { (across.name) " " (format!("{:.2}", across.at)) }
-            }
-            g .(class) {
-                polyline .line points=(line) {}
-                @for (k, value) in values.iter().enumerate() {
-                    @let (x, y) = at(k);
-                    a href=(format!("/runs/{}", value.run)) {
-                        @if is_out(all[k]) {
-                            path .out d=(format!("M{x:.1} {:.1} l7 12 h-14 Z", y - 8.0)) { (tooltip(value, all[k], true)) }
-                        } @else {
-                            circle cx=(format!("{x:.1}")) cy=(format!("{y:.1}")) r="3" { (tooltip(value, all[k], false)) }
-                        }
-                    }
-                }
-            }
-        }
+    let offset = values.len() - all.len();
+    let at = |k: usize| [(k + offset) as f64, all[k]];
+    let dot = |k: usize| {
+        let (value, is_out) = (&values[k + offset], is_out(all[k]));
+        Mark::Dot(Dot {
+            at: at(k),
+            shape: if is_out { Shape::Out } else { Shape::Small },
+            tooltip: tooltip(value, all[k], is_out),
+            link: format!("/runs/{}", value.run),
+        })
+    };
+    let line = Mark::Line((0..all.len()).map(at).collect());
+    Layer {
+        class: class.to_owned(),
+        marks: std::iter::once(line).chain((0..all.len()).map(dot)).collect(),
+        ..Layer::default()
     }
+}
+
+/// Draws a chart of parts in their order, with µm from 0 to a little above `most_um` upwards.
+fn drawn((title, height): (String, f64), values: &[Value], most_um: f64, layers: [Layer; 2]) -> Markup {
+    let number = |value: f64, decimals: usize| format!("{value:.decimals$}");
+    let last = values.len().saturating_sub(1);
+    let date = |k: usize| (k as f64, values[k].when.get(..10).unwrap_or_default().to_owned());
+    let x = ChartAxis {
+        range: [-0.5, last as f64 + 0.5],
+        ticks: marked(values.len()).into_iter().map(date).collect(),
+        ..ChartAxis::default()
+    };
+    let most_um = if most_um > 0.0 { 1.05 * most_um } else { 1.0 };
+    let chart = Chart {
+        title,
+        size: [WIDTH, height],
+        right_margin: RIGHT,
+        x,
+        y: ChartAxis::new("", Scale::Linear, [0.0, most_um], 5, &number),
+        layers: layers.into(),
+        ..Chart::default()
+    };
+    PreEscaped(chart.to_markup())
 }
 
 /// Returns the tooltip of a point of a chart: serial number, cell, time and value. `is_out` is true for a value outside
 /// the control limits.
-fn tooltip(value: &Value, um: f64, is_out: bool) -> Markup {
+fn tooltip(value: &Value, um: f64, is_out: bool) -> String {
     let out = if is_out { ", OUT OF LIMITS" } else { "" };
-    html! { title { (shown(&value.serial)) ", " (shown(&value.cell)) ", " (value.when) ": " (format!("{um:.3}")) " µm" (out) } }
+    format!("{}, {}, {}: {um:.3} µm{out}", shown(&value.serial), shown(&value.cell), value.when)
 }
 
-/// Moves labels upwards until they do not overlap. `at` contains the y coordinate of each label in pixels, measured
-/// downwards from the top. Returns the new coordinates in the same order. The lowest label keeps its position.
-fn apart(mut at: Vec<f64>) -> Vec<f64> {
-    let mut order: Vec<usize> = (0..at.len()).collect();
-    order.sort_by(|a, b| at[*b].total_cmp(&at[*a]));
-    for pair in order.windows(2) {
-        at[pair[1]] = at[pair[1]].min(at[pair[0]] - 13.0);
-    }
-    at
-}
-
-/// Scale of a chart: parts in their order on the x axis, µm from 0 upwards on the y axis.
-struct Scale {
-    max: f64,
-    count: usize,
-    height: f64,
-}
-
-impl Scale {
-    fn x(&self, k: usize) -> f64 {
-        let share = if self.count > 1 { k as f64 / (self.count - 1) as f64 } else { 0.5 };
-        LEFT + 10.0 + share * (WIDTH - LEFT - RIGHT - 20.0)
-    }
-
-    fn y(&self, value: f64) -> f64 {
-        let share = if self.max > 0.0 { value / (1.05 * self.max) } else { 0.0 };
-        self.height - BOTTOM - share * (self.height - TOP - BOTTOM - 8.0)
-    }
-
-    /// Returns the values, in µm, of the ticks on the y axis. The values are 0 and the multiples of a round step, up to
-    /// the maximum of the chart. The step is 1, 2 or 5 times a power of ten. There are at most five ticks.
-    fn ticks(&self) -> Vec<f64> {
-        let step = round_step(self.max / 4.0);
-        // Rounds, so that a tick is 0.6 and not 0.6000000000000001.
-        let per_step = 10f64.powf(-step.log10().floor());
-        let round = |tick: f64| (tick * per_step).round() / per_step;
-        (0..20).map(|k| f64::from(k) * step).take_while(|tick| *tick <= 1.04 * self.max).map(round).collect()
-    }
-
-    /// Returns the indices of the values whose dates are written on the x axis: at most six, evenly spaced.
-    fn marked(&self) -> Vec<usize> {
-        let most = 6.min(self.count);
-        let mut marked: Vec<usize> = (0..most).map(|k| k * (self.count - 1) / (most - 1).max(1)).collect();
-        marked.dedup();
-        marked
-    }
-}
-
-/// Returns the smallest number of the form 1, 2 or 5 times a power of ten that is at least `least`. Returns 1 if
-/// `least` is not a finite number above 0.
-pub(super) fn round_step(least: f64) -> f64 {
-    if !(least > 0.0 && least.is_finite()) {
-        return 1.0;
-    }
-    let decade = 10f64.powf(least.log10().floor());
-    let step = [1.0, 2.0, 5.0, 10.0].into_iter().find(|step| step * decade >= least * 0.999_999);
-    step.unwrap_or(10.0) * decade
+/// Returns the indices of the values whose dates are written on the x axis: at most six, evenly spaced.
+fn marked(count: usize) -> Vec<usize> {
+    let most = 6.min(count);
+    let mut marked: Vec<usize> = (0..most).map(|k| k * (count - 1) / (most - 1).max(1)).collect();
+    marked.dedup();
+    marked
 }
 
 #[cfg(test)]
@@ -305,10 +235,5 @@ mod tests {
         assert!(!svg.contains("<b>") && svg.contains("&lt;b&gt;") && !svg.contains("NaN"), "{svg}");
         let svg = moving_ranges("PV", "pv", &values, &limits).into_string();
         assert_eq!((svg.matches("class=\"out\"").count(), svg.matches("<circle").count()), (1, 29), "{svg}");
-    }
-
-    #[test]
-    fn steps_are_round() {
-        assert_eq!([0.9, 1.0, 1.1, 4.0, 70.0, 0.03].map(round_step), [1.0, 1.0, 2.0, 5.0, 100.0, 0.05]);
     }
 }
