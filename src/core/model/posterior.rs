@@ -118,6 +118,36 @@ pub(super) struct PosteriorSamples {
     pub(super) random_effects: DMatrix<f64>,
 }
 
+/// Share of the parts that is expected to resemble no earlier part.
+const DISSIMILAR_SHARE: f64 = 0.2;
+
+/// Returns the logarithm of the sum of the exponentials.
+fn log_sum_exp(values: impl Iterator<Item = f64>) -> f64 {
+    let all: Vec<f64> = values.collect();
+    let top = all.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    top + all.iter().map(|value| (value - top).exp()).sum::<f64>().ln()
+}
+
+/// Returns the logarithm of the prior density of each hypothesis and variance ratio.
+///
+/// Without `priors` from earlier parts it is that of the hypothesis. Otherwise it is a mixture of both, each with the
+/// sum 1: a part that resembles no earlier part, which the weight [`DISSIMILAR_SHARE`] expects, is judged as if no part
+/// had been made (robust prior, Schmidli and others 2014). The sum of the mixture is that of the hypotheses.
+fn expected_densities(hypotheses: &[FieldHypothesis], priors: Option<&Prior>) -> Vec<Vec<f64>> {
+    let untaught: Vec<Vec<f64>> = hypotheses.iter().map(|node| node.prior.clone()).collect();
+    let Some(priors) = priors else { return untaught };
+    let of = |node: &FieldHypothesis| -> Vec<f64> {
+        variance_ratios().map(|tau| priors.log_density(node.range_mm, (tau * node.scale).sqrt().recip())).collect()
+    };
+    let taught: Vec<Vec<f64>> = hypotheses.iter().map(of).collect();
+    let [sum_taught, sum_untaught] = [&taught, &untaught].map(|all| log_sum_exp(all.iter().flatten().copied()));
+    let mixed = |(taught, untaught): (&f64, &f64)| {
+        let like = taught - sum_taught + sum_untaught + (1.0 - DISSIMILAR_SHARE).ln();
+        log_sum_exp([like, untaught + DISSIMILAR_SHARE.ln()].into_iter())
+    };
+    taught.iter().zip(&untaught).map(|(taught, untaught)| taught.iter().zip(untaught).map(mixed).collect()).collect()
+}
+
 impl<'f> Posterior<'f> {
     /// Computes the posterior probability of every node (one smoothness with one range) at every variance ratio of
     /// field to noise.
@@ -150,20 +180,15 @@ impl<'f> Posterior<'f> {
             evidence: 0.0,
             squares: products[(0, 0)],
         };
-        let of = |(k, node): (usize, &FieldHypothesis)| {
+        let expected = expected_densities(&fields.hypotheses, priors);
+        let of = |(k, expected): (usize, &Vec<f64>)| {
             let likelihoods: Vec<f64> =
                 variance_ratios().map(|tau| posterior.noise_likelihood(k, tau).log_marginal()).collect();
-            let expected = |(tau, prior): (f64, &f64)| match priors {
-                Some(priors) => priors.log_density(node.range_mm, (tau * node.scale).sqrt().recip()),
-                None => *prior,
-            };
-            let expected = variance_ratios().zip(&node.prior).map(expected);
             let densities =
                 likelihoods.iter().zip(expected).map(|(likelihood, expected)| likelihood + expected).collect();
             (likelihoods, densities)
         };
-        let (likelihoods, densities): (Vec<Vec<f64>>, Vec<Vec<f64>>) =
-            fields.hypotheses.par_iter().enumerate().map(of).unzip();
+        let (likelihoods, densities): (Vec<Vec<f64>>, Vec<Vec<f64>>) = expected.par_iter().enumerate().map(of).unzip();
         let best = likelihoods.into_iter().flatten().fold(f64::NEG_INFINITY, f64::max);
         let none = if fields.hypotheses.is_empty() { best } else { posterior.noise_likelihood(0, 0.0).log_marginal() };
         Self { densities, evidence: best - none, ..posterior }
@@ -172,13 +197,8 @@ impl<'f> Posterior<'f> {
     /// Returns the logarithm of the marginal likelihood of the deviations: the likelihood, averaged over all nodes and
     /// variance ratios with their prior probabilities.
     fn log_likelihood(&self) -> f64 {
-        let sum = |of: &mut dyn Iterator<Item = f64>| {
-            let all: Vec<f64> = of.collect();
-            let top = all.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-            top + all.iter().map(|of| (of - top).exp()).sum::<f64>().ln()
-        };
-        let expected = sum(&mut self.fields.hypotheses.iter().flat_map(|node| &node.prior).copied());
-        sum(&mut self.densities.iter().flatten().copied()) - expected + self.fields.log_whitened
+        let expected = log_sum_exp(self.fields.hypotheses.iter().flat_map(|node| &node.prior).copied());
+        log_sum_exp(self.densities.iter().flatten().copied()) - expected + self.fields.log_whitened
     }
 
     /// Returns the likelihood as a function of the standard deviation of the noise. The field is given by the node
@@ -777,6 +797,22 @@ mod tests {
         let [a, b] = [observed, tenfold].map(|observed| Hyperparameters::estimate(&observed, None).unwrap());
         assert!((b.field.sigma_mm / a.field.sigma_mm - 10.0).abs() < 1e-6);
         assert!((b.field.range_mm / a.field.range_mm - 1.0).abs() < 1e-9);
+    }
+
+    /// Priors that exclude everything but one range leave the fifth of the other parts as it was.
+    #[test]
+    fn dissimilar_part_is_judged_without_earlier_parts() {
+        let observed = simulated(PLANTED, places(60), Vec::new(), 3);
+        let fields = FieldHypotheses::over(&observed, NoiseKind::PLAIN).unwrap();
+        let untaught = expected_densities(&fields.hypotheses, None);
+        let priors = Prior { range_mm: [30.0, 1.0 + 1e-9], noise_ratio: [0.1, 1.0 + 1e-9] };
+        let taught = expected_densities(&fields.hypotheses, Some(&priors));
+        let sum = |all: &[Vec<f64>]| log_sum_exp(all.iter().flatten().copied());
+        assert!((sum(&taught) - sum(&untaught)).abs() < 1e-9, "{} {}", sum(&taught), sum(&untaught));
+        let pairs = || taught.iter().flatten().zip(untaught.iter().flatten());
+        let kept = pairs().filter(|(taught, untaught)| (**taught - **untaught - 0.2f64.ln()).abs() < 1e-9).count();
+        // One place, or a few that are equally near, have the rest.
+        assert!(kept + 4 >= pairs().count() && kept < pairs().count(), "{kept} of {}", pairs().count());
     }
 
     /// Compares the likelihood with the one that the covariance of the basis functions gives directly, for few and for

@@ -128,6 +128,7 @@ fn simulated(hyperparameters: &Hyperparameters, seed: u64) -> Observations {
 
 #[test]
 fn part_priors_improve_few_points() {
+    let mut gains = Vec::new();
     for planted in [hyperparameters(30.0, 0.1), hyperparameters(20.0, 0.3)] {
         let every = Prior::for_size(102.0 / 3.0);
         let mut taught = PartPriors::default();
@@ -149,8 +150,10 @@ fn part_priors_improve_few_points() {
         let (untaught, told) = (off(&every), off(&lesson.prior()));
         println!("{lesson:?}: off by {told:.2?} of their logarithms, untaught by {untaught:.2?}");
         // A range that is no wider than the points are apart is told by neither.
-        assert!(told[0] < 1.05 * untaught[0] && told[1] < 0.8 * untaught[1], "{told:?} {untaught:?}");
+        assert!(told[0] < 1.05 * untaught[0] && told[1] < 0.95 * untaught[1], "{told:?} {untaught:?}");
+        gains.push(told[1] / untaught[1]);
     }
+    assert!(gains.iter().sum::<f64>() < 0.8 * gains.len() as f64, "{gains:?}");
 }
 
 #[test]
@@ -184,6 +187,9 @@ fn unlike_part_overrides_priors() {
     for (length_mm, rms_mm, lesson) in [(30.0, 5e-3, many(8.0, 1.0)), (15.0, 1e-3, many(200.0, 0.01))] {
         let ((plain, wide), (held, narrow)) = (coverage(length_mm, rms_mm, None), coverage(length_mm, rms_mm, lesson));
         println!("{lesson:?}: held {held:?} of {}, {narrow:.3?} wide; untaught {plain:?}, {wide:.3?}", parts());
-        assert!(held.iter().zip(plain).all(|(held, plain)| held + 1 >= plain.min(parts() - 1)), "{held:?} {plain:?}");
+        // Among many parts, some are held by one of the two alone.
+        let slack = 1.max(3 * parts() / 100);
+        let is_as_good = |(held, plain): (&u64, u64)| held + slack >= plain.min(parts() - 1);
+        assert!(held.iter().zip(plain).all(is_as_good), "{held:?} {plain:?}");
     }
 }
