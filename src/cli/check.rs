@@ -109,7 +109,7 @@ fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
         return ("dialect", read_dialect(path).map(good));
     }
     if has_table(path, &["[cell]", "[cmm", "[[cmm", "[grinder]", "[grinder.", "[[grinder"]) {
-        let good = |cell: CellConfig| Good { sha256: HEXLOWER.encode(cell.source_sha256()), notes: cell.notes() };
+        let good = |cell: CellConfig| Good { sha256: HEXLOWER.encode(cell.source_sha256()), notes: cell_notes(&cell) };
         return ("cell file", CellConfig::read(path).map(good));
     }
     let checked = Recipe::read(path).and_then(|recipe| {
@@ -118,6 +118,11 @@ fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
         Ok(Good { sha256: HEXLOWER.encode(recipe.source_sha256()), notes: recipe.notes().to_vec() })
     });
     ("recipe", checked)
+}
+
+/// Returns the notes of a cell file, with a note for each machine whose calibration is overdue today.
+pub(super) fn cell_notes(cell: &CellConfig) -> Vec<String> {
+    cell.notes().into_iter().chain(cell.calibration_notes(&regrind::report::today())).collect()
 }
 
 /// Returns true if a line of the file at `path` begins with one of the table headers in `heads`. The headers show the

@@ -91,7 +91,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let cell = check::or_show(CellConfig::read(path))?;
     let mut findings =
         vec![Finding::new("cell", FindingLevel::Good, format!("{} is a good cell file", path.display()))];
-    findings.extend(cell.notes().into_iter().map(|note| Finding::new("cell", FindingLevel::Notice, note)));
+    findings.extend(check::cell_notes(&cell).into_iter().map(|note| Finding::new("cell", FindingLevel::Notice, note)));
     findings.extend([folder(runs), clock(runs), signing()]);
     findings.extend(open_runs(runs));
     findings.extend(recipe.as_ref().map(|recipe| Finding::from_result("recipe", fits(recipe, &cell))));

@@ -27,6 +27,7 @@ mod register;
 mod report;
 mod resume;
 mod run;
+mod run_plan;
 mod runs;
 mod runtime;
 mod schema;

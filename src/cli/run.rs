@@ -75,7 +75,9 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let recipe = check::or_show(Recipe::read(&arguments.recipe))?;
     let mut cell = check::or_show(CellConfig::read(&arguments.cell))?;
-    for (path, notes) in [(&arguments.recipe, recipe.notes()), (&arguments.cell, cell.renamed_keys())] {
+    let of_cell: Vec<String> =
+        cell.renamed_keys().iter().cloned().chain(cell.calibration_notes(&regrind::report::today())).collect();
+    for (path, notes) in [(&arguments.recipe, recipe.notes()), (&arguments.cell, &of_cell[..])] {
         for note in notes.iter().filter(|_| !arguments.json) {
             super::print(&format!("note     {}, {note}\n", path.display()))?;
         }

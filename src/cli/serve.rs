@@ -4,21 +4,16 @@ use std::io::{self, IsTerminal, Read, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::Mutex;
 use std::time::Duration;
 
 use clap::Args;
-use regrind::config::CellConfig;
-use regrind::formats::run_files::RunFile;
-use regrind::recipe::Recipe;
-use regrind::record::begin_of;
-use regrind::setup;
 use regrind_page::{Entrance, Page, Tls, UsersFile, Viewers};
 use tokio::net::TcpListener;
 
 use super::Outcome;
 use super::failure::Failure;
 use super::outside::Endings;
+use super::run_plan::RunPlans;
 
 /// Default address of the page.
 pub(super) const ADDRESS: &str = "127.0.0.1:7373";
@@ -98,11 +93,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     super::runtime()?.block_on(async {
         let (listener, entrance) = door.open(*listen).await?;
         let taken = |source| Failure::Page { address: *listen, source };
-        let planned = PlannedPointsCache::default();
         let page = Page::new(
             std::path::absolute(runs).unwrap_or_else(|_| runs.clone()),
             entrance,
-            Box::new(move |run| planned.points(run)),
+            Box::new(RunPlans::default()),
             Box::new(|what| eprintln!("page: {what}")),
         );
         let page = page.map_err(taken)?.with_first_run(first_run.clone());
@@ -205,36 +199,4 @@ async fn ended(process: &mut Child) {
     while process.try_wait().is_ok_and(|status| status.is_none()) {
         polls.tick().await;
     }
-}
-
-/// Cache of planned points: those of the run that was requested last.
-#[derive(Default)]
-struct PlannedPointsCache(Mutex<Option<(PathBuf, Vec<[f64; 2]>)>>);
-
-impl PlannedPointsCache {
-    fn points(&self, run: &Path) -> Option<Vec<[f64; 2]>> {
-        let mut last = self.0.lock().ok()?;
-        if let Some((known, points)) = &*last
-            && known == run
-        {
-            return Some(points.clone());
-        }
-        let points = planned(run)?;
-        *last = Some((run.to_owned(), points.clone()));
-        Some(points)
-    }
-}
-
-/// Returns the planned measuring points (x, y) of the run in the folder `run`, in mm in the model frame. Computes the
-/// points again from the recipe and the cell file in this folder. Returns `None` if the recipe, the cell file or the
-/// first record is missing or invalid.
-fn planned(run: &Path) -> Option<Vec<[f64; 2]>> {
-    let begin = begin_of(run).ok()?;
-    let start = begin.content.part()?;
-    let from = PathBuf::from(start.working_folder.as_ref()?);
-    let text = |file: RunFile| std::fs::read_to_string(run.join(file.name())).ok();
-    let recipe = Recipe::parse(&from.join(start.recipe.as_ref()?), &text(RunFile::Recipe)?).ok()?;
-    let cell = CellConfig::parse(&from.join(start.cell.as_ref()?), &text(RunFile::Cell)?).ok()?;
-    let (task, _) = setup::prepare(&recipe, &cell).ok()?;
-    Some(task.targets.iter().map(|target| [target.point.x, target.point.y]).collect())
 }

@@ -109,6 +109,8 @@ pub struct LinkConfig {
     pub signals: Vec<Signal>,
     /// Name that the machine must report in its identity block.
     pub expected_name: Option<String>,
+    /// Day on which the calibration of the machine must be repeated, `2027-03-31`.
+    pub calibration_due: Option<String>,
 }
 
 /// Reference sphere on which the probe is checked.

@@ -54,6 +54,7 @@ struct MachineTables<'w> {
     key: &'static str,
     wire: Option<&'w Wire>,
     expected_name: Option<&'w String>,
+    calibration_due: Option<&'w String>,
     timing: &'w TimingTable,
     registers: Option<&'w RegisterMap>,
     signals: &'w [SignalTable],
@@ -71,6 +72,7 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
             key: "cmm",
             wire: cmm.wire.as_ref(),
             expected_name: cmm.expected_name.as_ref(),
+            calibration_due: cmm.calibration_due.as_ref(),
             timing: &cmm.timing,
             registers: cmm.registers.as_ref(),
             signals: &cmm.signals,
@@ -79,6 +81,7 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
             key: "grinder",
             wire: grinder.wire.as_ref(),
             expected_name: grinder.expected_name.as_ref(),
+            calibration_due: grinder.calibration_due.as_ref(),
             timing: &grinder.timing,
             registers: grinder.registers.as_ref(),
             signals: &grinder.signals,
@@ -121,6 +124,24 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
     }
 }
 
+/// Returns true if `text` is a day of the calendar in the form `2027-03-31`.
+fn is_day(text: &str) -> bool {
+    let fields: Vec<&str> = text.split('-').collect();
+    let [year, month, day] = fields[..] else { return false };
+    if (year.len(), month.len(), day.len()) != (4, 2, 2) || !text.bytes().all(|b| b.is_ascii_digit() || b == b'-') {
+        return false;
+    }
+    let [year, month, day] = [year, month, day].map(|field| field.parse::<u32>().unwrap_or(0));
+    let is_leap = year % 4 == 0 && (year % 100 != 0 || year % 400 == 0);
+    let days = match month {
+        2 => 28 + u32::from(is_leap),
+        4 | 6 | 9 | 11 => 30,
+        1..=12 => 31,
+        _ => 0,
+    };
+    (1..=days).contains(&day)
+}
+
 impl MachineTables<'_> {
     fn key(&self, rest: &str) -> String {
         format!("{}.{rest}", self.key)
@@ -141,8 +162,14 @@ impl MachineTables<'_> {
                 document.report(&self.key(table), found, "it would have no effect", "remove it, or change the wire");
             }
         }
-        let expected_name = self.expected_name.cloned();
-        Some(LinkConfig { wire: wire.clone(), timing, registers, signals: signals?, expected_name })
+        if let Some(due) = self.calibration_due.filter(|due| !is_day(due)) {
+            let remedy = "write the day as `calibration_due = \"2027-03-31\"`, or remove the key";
+            let found = format!("is {due:?}");
+            document.report(&self.key("calibration_due"), found, "a day, such as \"2027-03-31\"", remedy);
+        }
+        let [expected_name, calibration_due] =
+            [self.expected_name, self.calibration_due].map(Option::<&String>::cloned);
+        Some(LinkConfig { wire: wire.clone(), timing, registers, signals: signals?, expected_name, calibration_due })
     }
 
     fn timing(&self, document: &mut Document) -> Timing {

@@ -113,6 +113,20 @@ impl CellConfig {
         notes
     }
 
+    /// Returns a note for each machine whose calibration had to be repeated before `today`, a day in the form
+    /// `2027-03-31`.
+    pub fn calibration_notes(&self, today: &str) -> Vec<String> {
+        let links = [("cmm", "CMM", &self.cmm.link), ("grinder", "grinder", &self.grinder.link)];
+        let note = |(key, name, link): (&str, &str, &LinkConfig)| {
+            let due = link.calibration_due.as_ref().filter(|due| due.as_str() < today)?;
+            Some(format!(
+                "the calibration of the {name} was due on {due} ({key}.calibration_due), so its errors are no longer \
+                 known; have the machine calibrated, then write the next day into the cell file"
+            ))
+        };
+        links.into_iter().filter_map(note).collect()
+    }
+
     /// Returns one note for each key that the cell file has under its old name. The note states the line and the new
     /// name. The value under an old name is still used.
     pub fn renamed_keys(&self) -> &[String] {

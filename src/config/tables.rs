@@ -44,6 +44,9 @@ pub(super) struct CmmTable {
     /// The name that the machine must have in its identity block.
     #[schemars(length(min = 1, max = 32))]
     pub expected_name: Option<String>,
+    /// Day on which the calibration of the machine must be repeated. Regrind warns after it, and goes on.
+    #[schemars(regex(pattern = r"^[0-9]{4}-[0-9]{2}-[0-9]{2}$"), example = &"2027-03-31")]
+    pub calibration_due: Option<String>,
     /// Timeouts and intervals.
     pub timing: TimingTable,
     /// Addresses of the blocks of its Modbus map.
@@ -74,6 +77,9 @@ pub(super) struct GrinderTable {
     /// The name that the machine must have in its identity block.
     #[schemars(length(min = 1, max = 32))]
     pub expected_name: Option<String>,
+    /// Day on which the calibration of the machine must be repeated. Regrind warns after it, and goes on.
+    #[schemars(regex(pattern = r"^[0-9]{4}-[0-9]{2}-[0-9]{2}$"), example = &"2027-03-31")]
+    pub calibration_due: Option<String>,
     /// Timeouts and intervals.
     pub timing: TimingTable,
     /// Addresses of the blocks of its Modbus map.

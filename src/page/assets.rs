@@ -5,12 +5,13 @@ use axum::http::StatusCode;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 
-const ASSETS: [(&str, &str, &str); 7] = [
+const ASSETS: [(&str, &str, &str); 8] = [
     ("page.css", "text/css; charset=utf-8", include_str!("assets/page.css")),
     ("page.js", "text/javascript; charset=utf-8", include_str!("assets/page.js")),
     ("map.js", "text/javascript; charset=utf-8", include_str!("assets/map.js")),
     ("relief.js", "text/javascript; charset=utf-8", include_str!("assets/relief.js")),
     ("post.js", "text/javascript; charset=utf-8", include_str!("assets/post.js")),
+    ("refresh.js", "text/javascript; charset=utf-8", include_str!("assets/refresh.js")),
     ("theme.js", "text/javascript; charset=utf-8", include_str!("assets/theme.js")),
     ("icon.svg", "image/svg+xml", include_str!("assets/icon.svg")),
 ];

@@ -28,7 +28,7 @@ use super::rate::Rate;
 use super::sessions::SignedIn;
 use super::subject::PageSubject;
 use super::tls::Tls;
-use super::users::{Person, UsersFile};
+use super::users::{PageRole, Person, UsersFile};
 
 /// Cookies of a page; the port is part of their names, because a browser keeps one set for all pages of a computer.
 const KEY_COOKIE: &str = "regrind_key";
@@ -117,6 +117,11 @@ pub(crate) struct Guard {
 pub(crate) type LogSink = dyn Fn(&str) + Send + Sync;
 
 impl Guard {
+    /// Returns the names and roles of the people who can sign in; `None` if the page has a key instead.
+    pub(crate) fn users(&self) -> Option<Vec<(String, PageRole)>> {
+        self.entrance.users.as_ref().map(UsersFile::names)
+    }
+
     pub(crate) fn new(
         entrance: Entrance,
         of: PageSubject,
@@ -368,6 +373,14 @@ impl Session {
     /// key of the page acts for the operating-system user that serves the page, and can give all orders.
     pub(crate) fn may(&self, order: &str) -> bool {
         self.person.as_ref().is_none_or(|person| person.role.may(order))
+    }
+}
+
+impl Session {
+    /// Returns true if the person at the browser may see who else can sign in: an engineer, or whoever has the key of
+    /// the page.
+    pub(crate) fn is_engineer(&self) -> bool {
+        self.person.as_ref().is_none_or(|person| person.role == PageRole::Engineer)
     }
 }
 

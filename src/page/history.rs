@@ -26,6 +26,11 @@ impl History {
         Self { runs, read: Mutex::default() }
     }
 
+    /// Returns the folder of all runs.
+    pub(crate) fn home(&self) -> &Path {
+        &self.runs
+    }
+
     /// Returns the folder of the run named `id`. Returns `None` if there is no such run. Also returns `None` if `id` is
     /// not a plain folder name, for example if it contains a slash or begins with a dot. Such a name could give access
     /// to files outside the folder of all runs.

@@ -115,7 +115,7 @@ impl Language {
 
 /// Formats a number with the given number of decimals, and with the decimal sign of `language`.
 pub(crate) fn decimal(value: f64, digits: usize, language: Language) -> String {
-    format!("{value:.digits$}").replacen('.', &language.catalogue().decimal_sign, 1)
+    format!("{value:.digits$}").replacen('.', &language.catalogue().decimal_sign, 1).replacen('-', "\u{2212}", 1)
 }
 
 /// Formats a number with all its decimals, and with the decimal sign of `language`.

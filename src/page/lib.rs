@@ -14,12 +14,14 @@ mod alarms;
 mod assets;
 mod attachment;
 mod chart;
+mod components;
 mod gauge;
 mod guard;
 mod guarded_server;
 mod history;
 mod language;
 mod live;
+mod machines_view;
 mod operator_step;
 mod orders;
 mod parts_view;
@@ -27,6 +29,7 @@ mod pieces;
 mod rate;
 mod record_view;
 mod sessions;
+mod settings_view;
 mod shape;
 mod shared;
 mod sign_in;
@@ -49,7 +52,7 @@ use tokio::net::TcpListener;
 
 pub use guard::{Entrance, Session};
 pub use guarded_server::GuardedServer;
-pub use shared::{Page, PlannedPoints};
+pub use shared::{Equipment, Page, RunPlan};
 pub use subject::PageSubject;
 pub use tls::{Tls, TlsError};
 pub use users::{PageRole, Person, Users, UsersError, UsersFile};
@@ -66,14 +69,14 @@ const MAX_MEASUREMENT_BYTES: usize = 64 << 20;
 
 impl Page {
     /// Creates the page for the runs in the folder `runs`. `entrance` contains the address and the access rules of the
-    /// page. `planned` returns the planned touch points of a run. `log` gets the messages that are in no other record.
+    /// page. `plan` plans the runs again, for what their folders do not contain. `log` gets the messages that are in no other record.
     ///
     /// # Errors
     /// The operating system has no random numbers for the key.
     pub fn new(
         runs: PathBuf,
         entrance: Entrance,
-        planned: Box<PlannedPoints>,
+        plan: Box<dyn RunPlan>,
         log: Box<dyn Fn(&str) + Send + Sync>,
     ) -> io::Result<Self> {
         let history = Arc::new(History::new(runs));
@@ -82,7 +85,7 @@ impl Page {
         let on_record = Box::new(move |what| drop(orders::write_down(&runs, None, what)));
         let guard = Arc::new(Guard::new(entrance, PageSubject::Cell, log, on_record)?);
         let viewers = Viewers::new();
-        Ok(Self { guard, run_watcher: live, history, planned, viewers, first_run: None })
+        Ok(Self { guard, run_watcher: live, history, plan, viewers, first_run: None })
     }
 
     /// Shows the run named `run` first, even if other runs are active.
@@ -123,7 +126,12 @@ fn routes(page: Shared) -> Router {
         .route("/runs/{run}/step-file", get(operator_step::step_file))
         .route("/runs/{run}/report", get(view::report))
         .route("/runs/{run}/record", get(record_view::record))
+        .route("/machines", get(machines_view::home))
+        .route("/runs/{run}/machines", get(machines_view::machines))
+        .route("/settings", get(settings_view::settings))
+        .route("/components", get(components::components))
         .route("/runs/{run}/planned", get(shape::planned))
+        .route("/runs/{run}/path", get(shape::path))
         .route("/runs/{run}/touched", get(shape::touched))
         .route("/runs/{run}/cycles/{cycle}/map", get(shape::map))
         .route("/runs/{run}/cycles/{cycle}/points", get(shape::points))

@@ -6,6 +6,7 @@
 //!           the errors of all nodes first, then the standard uncertainties of all
 //!  points   f32 x, y, deviation a point, in the order measured; the deviation is NaN if the fit did not use the point
 //!  planned  f32 x, y a point, in the order in which it is to be touched
+//!  path     f32 x, y of the wheel's centre and the share of the path up to it a point; NaN begins a new track
 //!  touched  u32 cycle, batch, index of the first point, then f32 x, y, deviation from the planned position a point, in
 //!           the order measured; the deviation is NaN where the probe found nothing
 //! ```
@@ -47,10 +48,22 @@ pub(crate) async fn points(State(page): State<Shared>, Path((run, cycle)): Path<
 
 pub(crate) async fn planned(State(page): State<Shared>, Path(run): Path<String>) -> Response {
     respond(move || {
-        let points = (page.planned)(&page.history.folder(&run)?)?;
-        Some(Ok(Some(points.iter().flatten().flat_map(|value| (*value as f32).to_le_bytes()).collect())))
+        let points = page.plan.points(&page.history.folder(&run)?)?;
+        Some(Ok(Some(f32_bytes(points.iter().flatten()))))
     })
     .await
+}
+
+pub(crate) async fn path(State(page): State<Shared>, Path(run): Path<String>) -> Response {
+    respond(move || {
+        let path = page.plan.path(&page.history.folder(&run)?)?;
+        Some(Ok(Some(f32_bytes(path.iter().flatten()))))
+    })
+    .await
+}
+
+fn f32_bytes<'v>(values: impl Iterator<Item = &'v f64>) -> Vec<u8> {
+    values.flat_map(|value| (*value as f32).to_le_bytes()).collect()
 }
 
 /// Files of a cycle that a browser can save: the error map as a table, as pictures and as X3P, and the deviations.

@@ -31,7 +31,7 @@ macro_rules! texts {
 // The texts themselves are in `languages/`.
 texts! {
     // The frame of the page.
-    Cell Runs Parts Record ShiftLog Events NewEntry AddEntry Time Who Kind What Older RecordIntact SignedUpTo NotSigned RecordBroken
+    Cell Runs Parts Machines Settings Components Record ShiftLog Events NewEntry AddEntry Time Who Kind What Older RecordIntact SignedUpTo NotSigned RecordBroken
     Compare Language Appearance AsTheSystem Light Dark HighContrast SkipToOrders Simulation
     NotConnected ProgramGone SimulationGone PageGone
     // Texts about the part.
@@ -52,6 +52,14 @@ texts! {
     // Orders.
     Hold Resume Stop Abort Loaded IsClear DeclareOver WhatYouSaw FirstThing TakeControl ControlElsewhere
     NoButtonStops
+    // The machines.
+    MachinesNotLive Probe Wheel StateOfMachine Link Answers NoAnswerYet NoAnswerSince LostLinks Automatic
+    ClearOfPart Supplies Yes No NotReported NotStated AnswerTime Temperature CalibrationDue Overdue
+    RadiusTolerance RadiusError ReportedByGrinder InRecipe RemovedVolume LargestDepth SpindleLoad Duration
+    // The settings.
+    ThisBrowser SettingsStay WithKey Role FolderOfRuns
+    // The map, closer.
+    ZoomIn ZoomOut WholePart WheelOnPath
     // Steps of a person at a machine.
     StepMeasure StepMoveProbeClear StepBeginPass StepEndPass StepHold StepStop StepAbort CheckFirst
     RightPartClean RightPartClamped WheelIsClear ProbeIsClear ProbeFits WheelFits RequiredPoints AtLeast

@@ -277,6 +277,11 @@ impl UsersFile {
         read.1.clone()
     }
 
+    /// Returns the names and roles of the users, in the order of the file.
+    pub(crate) fn names(&self) -> Vec<(String, PageRole)> {
+        self.now().users.into_iter().map(|user| (user.name, user.role)).collect()
+    }
+
     /// Returns the user with this name and password; `None` if one of them is wrong. Blocks for some hundredths of a
     /// second.
     pub(crate) fn signs_in(&self, name: &str, password: &str) -> Option<AuthenticatedUser> {

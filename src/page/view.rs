@@ -62,6 +62,7 @@ pub(crate) fn state(seen: &ObservedRun, session: &Session, has_control: bool) ->
         "cycles": cycles,
         "toleranceUm": tolerance.map(|tolerance| 1e3 * tolerance.pv_mm).filter(|um| um.is_finite()),
         "deviations": [seen.touches.cycle as usize, seen.touches.batch as usize, seen.touches.deviations_um.len()],
+        "ground": progress.filter(|progress| progress.device == Device::Grinder).map(|progress| [progress.done, progress.total]),
         "touched": measures.map(|progress| [progress.done, progress.total]),
         "alarms": live.map_or(0, |live| live.alarms.len()),
         "verdict": verdict(seen),
@@ -102,19 +103,22 @@ fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static st
     can
 }
 
-/// Serves the page of the run that the page was started for, or of the active run, or of the last run if none is
-/// active.
+/// Serves the page of the run that the page shows first, or else the list of runs.
 pub(crate) async fn home(State(page): State<Shared>) -> Response {
-    let history = std::sync::Arc::clone(&page.history);
+    let path = first_run(&page).await.map_or("/runs".to_owned(), |run| format!("/runs/{}", in_path(&run)));
+    Redirect::to(&path).into_response()
+}
+
+/// Returns the name of the run that the page was started for, or of the active run, or of the last run if none is
+/// active. Returns `None` if there is no run, or if several are active.
+pub(super) async fn first_run(page: &Shared) -> Option<String> {
     if let Some(first) = page.first_run.as_ref().filter(|run| page.history.folder(run).is_some()) {
-        return Redirect::to(&format!("/runs/{}", in_path(first))).into_response();
+        return Some(first.clone());
     }
+    let history = std::sync::Arc::clone(&page.history);
     let listed = spawn_blocking(move || history.list()).await.unwrap_or_default();
     let live = listed.iter().filter(|run| run.is_live).count();
-    match listed.first().filter(|_| live <= 1) {
-        Some(first) => Redirect::to(&format!("/runs/{}", in_path(&first.id))).into_response(),
-        None => Redirect::to("/runs").into_response(),
-    }
+    listed.first().filter(|_| live <= 1).map(|first| first.id.clone())
 }
 
 pub(crate) async fn run(
@@ -208,6 +212,11 @@ fn map(language: Language) -> Markup {
                 button type="button" data-view="relief" aria-pressed="false" { (say(Text::Relief)) }
                 button type="button" data-points aria-pressed="false" { (say(Text::Points)) }
             }
+            div .zoom role="group" aria-label=(say(Text::Map)) {
+                button type="button" data-zoom="in" aria-label=(say(Text::ZoomIn)) title=(say(Text::ZoomIn)) { "+" }
+                button type="button" data-zoom="out" aria-label=(say(Text::ZoomOut)) title=(say(Text::ZoomOut)) { "−" }
+                button type="button" data-zoom="whole" { (say(Text::WholePart)) }
+            }
             label { (say(Text::Scale)) " "
                 select #scale {
                     option value="first" { (say(Text::ScaleOfFirst)) }
@@ -244,7 +253,7 @@ fn script_texts(language: Language) -> Value {
         "noData": say(Text::NotConnected), "pageGone": say(Text::PageGone), "programGone": say(Text::ProgramGone), "simulationGone": say(Text::SimulationGone),
         "noRelief": say(Text::NoRelief), "notMeasured": say(Text::NotMeasured), "planned": say(Text::Planned),
         "touched": say(Text::Touched), "filtered": say(Text::Filtered), "known": say(Text::KnownTo), "order": say(Text::NoButtonStops),
-        "sign": say(Text::SignOfMap), "noCycleBefore": say(Text::NoCycleBefore), "preliminary": say(Text::PreliminaryDots), "sectionHelp": say(Text::SectionHelp), "heights": say(Text::HeightFactor),
+        "sign": say(Text::SignOfMap), "noCycleBefore": say(Text::NoCycleBefore), "preliminary": say(Text::PreliminaryDots), "sectionHelp": say(Text::SectionHelp), "heights": say(Text::HeightFactor), "wheel": say(Text::WheelOnPath),
     })
 }
 
@@ -498,6 +507,10 @@ pub(crate) fn sign_in(status: StatusCode, of: PageSubject, headers: &HeaderMap, 
         .into_response()
 }
 
+/// Themes of the page by their names, with their texts. The first is that of the system.
+pub(super) const THEMES: [(&str, Text); 4] =
+    [("", Text::AsTheSystem), ("light", Text::Light), ("dark", Text::Dark), ("contrast", Text::HighContrast)];
+
 /// Frame around every page.
 struct Frame<'a> {
     language: Language,
@@ -556,6 +569,7 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                 }
                 script src="/assets/theme.js" {}
                 script src="/assets/post.js" defer {}
+                @if matches!(kind, Kind::Plain(PageSubject::Cell)) { script src="/assets/refresh.js" defer {} }
                 @if matches!(kind, Kind::WithMaps) {
                     script src="/assets/map.js" defer {}
                     script src="/assets/relief.js" defer {}
@@ -566,7 +580,7 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                 nav {
                     span .brand { "Regrind" }
                     @match kind.subject() {
-                        PageSubject::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } " " a href="/parts" { (say(Text::Parts)) } }
+                        PageSubject::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } " " a href="/parts" { (say(Text::Parts)) } " " a href="/machines" { (say(Text::Machines)) } " " a href="/settings" { (say(Text::Settings)) } }
                         PageSubject::Plant => {
                             @for (path, name) in [("/", "Plant"), ("/trend", "Trend"), ("/cells", "Compare"), ("/parts", "Parts")] { a href=(path) { (name) } " " }
                         }
@@ -588,7 +602,7 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                         }
                         label { (say(Text::Appearance)) " "
                             select #theme {
-                                @for (value, text) in [("", Text::AsTheSystem), ("light", Text::Light), ("dark", Text::Dark), ("contrast", Text::HighContrast)] {
+                                @for (value, text) in THEMES {
                                     option value=(value) { (say(text)) }
                                 }
                             }

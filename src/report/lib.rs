@@ -101,6 +101,13 @@ pub enum ReportError {
     File(#[from] FormatError),
 }
 
+/// Returns the present day in UTC, `2026-07-04`.
+pub fn today() -> String {
+    let mut now = regrind_journal::utc(std::time::SystemTime::now());
+    now.truncate(10);
+    now
+}
+
 /// Writes `text` to a file atomically, replacing the whole file.
 ///
 /// # Errors

@@ -11,7 +11,9 @@ use regrind_cell::{
 };
 use regrind_formats::run_files::{CycleFile, CycleFolder};
 use regrind_journal::{Reader, Record, RecordKind, Verified, verify};
-use regrind_record::{Begin, Content, EventDetail, EventRecord, PartEnd, Remark, RunContent, RunEnd, TouchCounts};
+use regrind_record::{
+    Begin, Content, EventDetail, EventRecord, PartEnd, PassFigures, Remark, RunContent, RunEnd, TouchCounts,
+};
 
 #[derive(Default)]
 pub(super) struct RunHistory {
@@ -67,6 +69,10 @@ pub(super) struct CycleHistory {
     pub(super) form: Option<String>,
     /// PV and RMS that are expected after the next pass, in millimetres.
     pub(super) expected_mm: Option<[f64; 2]>,
+    /// Figures of the pass, as the grinder reported them.
+    pub(super) pass: Option<PassFigures>,
+    /// Error of the probe's radius on the reference sphere, in millimetres.
+    pub(super) radius_error_mm: Option<f64>,
     /// Estimates of the parameters of the machine.
     pub(super) parameters: Vec<RecordedParameter>,
     /// Root mean square of the error that is left for the map in addition to the parameters, in millimetres.
@@ -188,6 +194,7 @@ impl RunHistory {
             }
             Content::Pass(pass) => {
                 self.wheel_radius_mm = pass.pass_record.wheel_radius_mm.or(self.wheel_radius_mm);
+                self.cycle(record.cycle).pass = Some(pass.pass_record);
             }
             Content::Reopen(_)
             | Content::Answer(_)
@@ -288,7 +295,10 @@ impl RunHistory {
                 let of_it = self.pass.as_mut().filter(|pass| pass.cycle == cycle);
                 of_it.into_iter().for_each(|pass| pass.result = Some(result));
             }
-            Event::Qualified { cycle, radius_error_mm } => self.radius_error_mm = Some((cycle, radius_error_mm)),
+            Event::Qualified { cycle, radius_error_mm } => {
+                self.radius_error_mm = Some((cycle, radius_error_mm));
+                self.cycle(cycle).radius_error_mm = Some(radius_error_mm);
+            }
             Event::Compensated { cycle, summary } => {
                 let story = self.cycle(cycle);
                 story.expected_mm = Some([summary.predicted_pv_mm, summary.predicted_rms_mm]);

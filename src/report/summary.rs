@@ -7,6 +7,7 @@ use super::run_history::{AlarmHistory, CycleHistory, HoldOrder, RunHistory};
 use super::words::{ending_words, home_words, verdict_words};
 use regrind_cell::{Ending, Tolerance};
 use regrind_journal::{Reader, Record};
+use regrind_record::PassFigures;
 
 /// Summary of the record of a run. The record is read but not verified; `regrind audit verify` and the report verify
 /// it.
@@ -106,6 +107,10 @@ pub struct CycleSummary {
     pub map: Option<String>,
     /// Name of the file of points within the run folder.
     pub deviations: Option<String>,
+    /// Figures of the pass, as the grinder reported them; `None` if they are not on record.
+    pub pass: Option<PassFigures>,
+    /// Error of the probe's radius on the reference sphere; `None` if it was not measured.
+    pub radius_error_um: Option<f64>,
 }
 
 /// Reads the record in the run folder `folder`, without verifying it, and returns its summary for a list of runs.
@@ -181,5 +186,7 @@ fn cycle_summary(cycle: u32, story: &CycleHistory, tolerance: Option<&Tolerance>
         expected: story.expected_mm.map(|figures| figures.map(|mm| 1e3 * mm)),
         map: story.map.as_ref().map(|(name, _)| name.clone()),
         deviations: story.deviations.clone(),
+        pass: story.pass,
+        radius_error_um: story.radius_error_mm.map(|mm| 1e3 * mm),
     }
 }

@@ -477,6 +477,30 @@ const BAD_RECIPES: &[BadText] = &[
 const BAD_CELLS: &[BadText] = &[
     (
         TCP,
+        "[cmm]\n",
+        "[cmm]\ncalibration_due = \"2027-02-29\"\n",
+        "cmm.calibration_due",
+        "\"2027-02-29\"",
+        "2027-03-31",
+    ),
+    (
+        TCP,
+        "[cmm]\n",
+        "[cmm]\ncalibration_due = \"31.03.2027\"\n",
+        "cmm.calibration_due",
+        "\"31.03.2027\"",
+        "2027-03-31",
+    ),
+    (
+        TCP,
+        "[cmm]\n",
+        "[cmm]\ncalibration_due = \"2027-13-01\"\n",
+        "cmm.calibration_due",
+        "\"2027-13-01\"",
+        "2027-03-31",
+    ),
+    (
+        TCP,
         "# [cmm.uncertainty]",
         "[cmm.uncertainty]\nscale_ppm = [0.5, -0.5, 0.5]\n#",
         "cmm.uncertainty.scale_ppm[1]",

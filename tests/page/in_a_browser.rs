@@ -159,6 +159,12 @@ fn run_page_draws_map_and_relief() {
     tab.until(&mut browser, &format!("document.querySelector('#relief').toDataURL() !== {before}"));
     tab.click(&mut browser, "[data-view=difference]");
     tab.until(&mut browser, &format!("!document.querySelector('#map').hidden && {} > 50", colours("#map")));
+    // Closer, and back to the same picture.
+    let whole = tab.read(&mut browser, "document.querySelector('#map').toDataURL()");
+    tab.click(&mut browser, "[data-zoom=in]");
+    tab.until(&mut browser, &format!("document.querySelector('#map').toDataURL() !== {whole}"));
+    tab.click(&mut browser, "[data-zoom=out]");
+    tab.until(&mut browser, &format!("document.querySelector('#map').toDataURL() === {whole}"));
     assert_eq!(tab.problems(&browser), Vec::<String>::new());
     assert_eq!(shown.run.end().0, 0);
 }
@@ -306,10 +312,14 @@ fn axe_finds_nothing_serious() {
     let place = shown.url.split("/?").next().unwrap().to_owned();
     let (run, runs) = (shown.url.clone(), format!("{place}/runs"));
     let compared = format!("{place}/compare?run={0}&run={0}", shown.id);
+    let [machines, settings, components] = ["machines", "settings", "components"].map(|view| format!("{place}/{view}"));
     for (url, there) in [
         (&run, "document.querySelectorAll('#cycle option').length > 0"),
         (&runs, "document.querySelector('main table')"),
         (&compared, "document.querySelectorAll('.compare section').length == 2"),
+        (&machines, "document.querySelector('.machines .pair')"),
+        (&settings, "document.querySelector('.settings-view')"),
+        (&components, "document.querySelector('.components')"),
         (&for_users, "document.querySelector('[name=password]')"),
     ] {
         let tab = browser.open(url, SCREEN);
@@ -324,6 +334,42 @@ fn axe_finds_nothing_serious() {
             );
             assert!(found[0].as_u64() > Some(5) && found[1] == json!([]), "{url}, {theme}: {found}");
         }
+    }
+}
+
+/// Views without a map, in each size and theme: nothing is wider than the screen, and no button is small on a phone.
+#[test]
+#[ignore = "needs a browser: Debian package chromium"]
+fn other_views_fit_every_screen() {
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = CellPage::begin(home.path(), 200.0);
+    assert_eq!(shown.run.end().0, 0);
+    let place = shown.url.split("/?").next().unwrap().to_owned();
+    let themes: &[&str] = if all() { &["light", "dark", "contrast"] } else { &["light"] };
+    let sizes: &[[u32; 2]] = if all() { &[[1920, 1080], [1024, 768], [390, 844]] } else { &[[1366, 768], [390, 844]] };
+    let mut browser = Browser::start(home.path());
+    for size in sizes {
+        let tab = browser.open(&shown.url, *size);
+        tab.until(&mut browser, "document.querySelector('.banner')");
+        for view in ["machines", "settings", "components", "parts", "runs", "parts/SN-0042", "record"] {
+            let path = if view == "record" { format!("runs/{}/record", shown.id) } else { view.to_owned() };
+            tab.send(&mut browser, "Page.navigate", json!({ "url": format!("{place}/{path}") }));
+            tab.until(&mut browser, &format!("location.href.endsWith('{view}') && document.querySelector('main h1')"));
+            for theme in themes {
+                let wrong = tab.read(
+                    &mut browser,
+                    &format!(
+                        "(() => {{ document.documentElement.dataset.theme = '{theme}'; const wrong = []; \
+                         if (document.documentElement.scrollWidth > innerWidth) wrong.push(document.documentElement.scrollWidth); \
+                         for (const e of document.querySelectorAll('main button, nav select, nav a')) \
+                         if (innerWidth < 500 && e.getBoundingClientRect().height < 43.5) wrong.push(e.outerHTML.slice(0, 80)); \
+                         return wrong; }})()"
+                    ),
+                );
+                assert_eq!(wrong, json!([]), "{view}, {size:?}, {theme}");
+            }
+        }
+        assert_eq!(tab.problems(&browser), Vec::<String>::new());
     }
 }
 

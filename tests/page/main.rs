@@ -38,8 +38,12 @@ impl CellPage {
     }
 
     fn start(home: &Path, recipe: &Path) -> Self {
-        let recipe = recipe.display().to_string();
-        let arguments = ["run", &recipe, "--cell", "sim", "--part", "SN-0042", "--operator", "A. Smith"];
+        Self::start_in(home, &recipe.display().to_string(), "sim")
+    }
+
+    /// Begins a run in the cell of a file.
+    fn start_in(home: &Path, recipe: &str, cell: &str) -> Self {
+        let arguments = ["run", recipe, "--cell", cell, "--part", "SN-0042", "--operator", "A. Smith"];
         let mut run = Running::new(regrind(&arguments, home));
         let folder = run.folder(home);
         let (page, url) = serve(home);

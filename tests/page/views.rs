@@ -299,3 +299,70 @@ fn record_is_shown_and_verified() {
     std::fs::write(&recipe, "# another recipe\n").unwrap();
     assert!(visitor.get(&path).text().contains("The record is not as it was written"));
 }
+
+/// A held cell shows the last answers of its machines. After its program is killed, the record and the cell file are
+/// left, and no value counts as live.
+#[test]
+fn machines_show_live_values_and_record() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 20.0).display().to_string();
+    let cell = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/config/sim.toml")).unwrap();
+    let due = "[cmm]\ncalibration_due = \"2001-02-28\"\n\n[cmm.wire]\n";
+    std::fs::write(home.path().join("cell.toml"), replaced(&cell, "[cmm.wire]\n", due)).unwrap();
+    let mut shown = CellPage::start_in(home.path(), &recipe, "cell.toml");
+    let (code, said, _) = run(&["check", "cell.toml"], home.path());
+    assert!(code == 0 && said.contains("calibration") && said.contains("2001-02-28"), "{said}");
+    shown.run.line("grinding", |line| line.contains("grinding"));
+    let visitor = shown.visitor();
+    assert_eq!(visitor.get("/machines").header("location"), [format!("/runs/{}/machines", shown.id)]);
+    let page = || visitor.get(&format!("/runs/{}/machines", shown.id)).text();
+    shown.run.until("temperatures", |_| (page().matches("Temperature").count() >= 2).then_some(()));
+    let live = page();
+    for piece in ["data-refresh-ms=\"2000\"", "IDLE", "EXECUTE", "unit 1", "unit 2", "class=\"chart\"", "12.5000 mm"] {
+        assert!(live.contains(piece), "{piece}: {live}");
+    }
+    assert!(live.contains("2001-02-28") && live.contains("overdue"), "{live}");
+    shown.run.signal("KILL");
+    shown.run.until("no live values", |_| page().contains("No live values").then_some(()));
+    let left = page();
+    assert!(!left.contains("data-refresh-ms") && !left.contains("EXECUTE") && left.contains("2001-02-28"), "{left}");
+}
+
+/// The path of the wheel begins a track with a point that is not finite, and its shares rise from 0 to 1.
+#[test]
+fn path_of_wheel_is_served() {
+    let home = tempfile::tempdir().unwrap();
+    let shown = CellPage::begin(home.path(), 20.0);
+    let answer = shown.visitor().get(&format!("/runs/{}/path", shown.id));
+    assert_eq!(answer.status, 200);
+    let values: Vec<f32> = answer.body.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+    let points: Vec<[f32; 3]> = values.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
+    assert!(points[0][0].is_nan() && points.len() > 100, "{}", points.len());
+    let shares: Vec<f32> = points.iter().map(|p| p[2]).filter(|share| !share.is_nan()).collect();
+    assert!(shares[0] == 0.0 && (shares[shares.len() - 1] - 1.0).abs() < 1e-6, "{shares:?}");
+    assert!(shares.windows(2).all(|pair| pair[0] <= pair[1]), "{shares:?}");
+    // The wheel runs over the edges of a part of 102 x 62 mm, but not far beyond.
+    let within = |k: usize, most: f32| points.iter().filter(|p| !p[k].is_nan()).all(|p| p[k].abs() < most);
+    assert!(within(0, 80.0) && within(1, 60.0));
+    shown.run.signal("KILL");
+}
+
+#[test]
+fn settings_and_components_are_shown() {
+    let home = tempfile::tempdir().unwrap();
+    std::fs::create_dir(home.path().join("runs")).unwrap();
+    for role in ["viewer", "engineer"] {
+        assert_eq!(crate::users::add(home.path(), role, role, crate::users::PASSWORD).0, 0);
+    }
+    let (_page, url) = crate::serve_with(home.path(), &["--listen", "127.0.0.1:0", "--users", "users.toml"]);
+    let settings = |name: &str| Visitor::signed_in(&url, name, crate::users::PASSWORD).unwrap().get("/settings").text();
+    // Who else can sign in is for engineers only.
+    let users = |text: &str| text.matches("<td>").count();
+    let [viewer, engineer] = ["viewer", "engineer"].map(settings);
+    assert!(users(&viewer) == 0 && users(&engineer) == 4, "{viewer}{engineer}");
+    assert!(viewer.contains(env!("CARGO_PKG_VERSION")) && viewer.contains("data-language=\"zh\""), "{viewer}");
+    let components = Visitor::signed_in(&url, "viewer", crate::users::PASSWORD).unwrap().get("/components").text();
+    for class in ["swatch", "gauge pv", "class=\"chart\"", "banner lost", "alarm past", "broken"] {
+        assert!(components.contains(class), "{class}: {components}");
+    }
+}

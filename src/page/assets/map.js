@@ -155,8 +155,14 @@ const regrindMap = (() => {
     return all.length ? [0, 1, 2, 3].map((k) => Math[k < 2 ? "min" : "max"](...all.map((of) => of[k]))) : null;
   }
 
-  /** Draws a map with its axes and its bar; returns how places on the page and on the part belong together. */
-  function draw(canvas, { grid, limit, colours, dots, mark, missing, most, frame, isPinned, hasBar = Boolean(grid) }) {
+  /** What was drawn last on each canvas below the mark, so that a mark that moves costs one copy. */
+  const drawn = new WeakMap();
+
+  /**
+   * Draws a map with its axes and its bar; returns how places on the page and on the part belong together. What has the
+   * same `of` is the same picture below the mark.
+   */
+  function draw(canvas, { of, grid, limit, colours, dots, path, mark, missing, most, frame, isPinned, hasBar = Boolean(grid) }) {
     const isEmpty = !grid && !(dots && dots.length);
     const [x0, y0, x1, y1] = isEmpty ? [0, 0, 1.6, 1] : frame || bounds(grid, (dots || []).map((dot) => dot.at));
     const [left, right, top, bottom] = [46, hasBar ? 84 : 12, 8, 38];
@@ -171,6 +177,7 @@ const regrindMap = (() => {
       context.fillText(missing || "", width / 2, height / 2);
       return null;
     }
+    const known = drawn.get(canvas);
     const scale = Math.min((width - left - right) / (x1 - x0), (height - top - bottom) / (y1 - y0));
     const [w, h] = [scale * (x1 - x0), scale * (y1 - y0)];
     const offset = left + Math.max(0, (width - left - right - w) / 2);
@@ -179,6 +186,16 @@ const regrindMap = (() => {
       toPage: (x, y) => [offset + (x - x0) * scale, top + h - (y - y0) * scale],
       toPart: (px, py) => [x0 + (px - offset) / scale, y0 + (top + h - py) / scale],
     };
+    const key = [width, height, window.devicePixelRatio, ink, ground, limit, x0, y0, x1, y1].join();
+    if (of && known && known.of === of && known.key === key) {
+      context.drawImage(known.image, 0, 0, width, height);
+      if (mark) cross(context, known.view, mark, { isPinned, offset, top, w, h, ink, ground });
+      return known.view;
+    }
+    context.save();
+    context.beginPath();
+    context.rect(offset, top, w, h);
+    context.clip();
     if (grid) {
       context.imageSmoothingQuality = "high";
       const [gx0, gy0, gx1, gy1] = bounds(grid, []);
@@ -187,34 +204,106 @@ const regrindMap = (() => {
     }
     if (dots && dots.length > MOST_DISCS) blocks(context, view, dots, [offset, top, w, h]);
     else discs(context, view, dots || [], { ground, ink, quiet });
+    if (path) wheelPath(context, view, path, { quiet, ground, area: [offset, top, w, h], isOver: Boolean(grid) });
+    if (grid && grid.low < 0) marks(context, view, extremes(grid), { offset, w, ink, ground });
+    context.restore();
     [context.strokeStyle, context.lineWidth] = [ink, 1];
     context.strokeRect(offset, top, w, h);
     axes(context, view, { x0, y0, x1, y1, offset, top, w, h, ink });
     if (hasBar) bar(context, { limit, low: grid ? grid.low : -1, colours, x: offset + w + 14, top, h, ink });
-    if (grid && grid.low < 0) marks(context, view, extremes(grid), { offset, w, ink, ground });
-    if (mark) {
-      const [px, py] = view.toPage(...mark);
-      if (isPinned) {
-        const style = getComputedStyle(document.documentElement);
-        [[offset, py, offset + w, py], [px, top, px, top + h]].forEach(([ax, ay, bx, by], k) => {
-          [context.strokeStyle, context.lineWidth] = [style.getPropertyValue(["--pv", "--rms"][k]).trim(), 1.4];
-          context.beginPath();
-          context.moveTo(ax, ay);
-          context.lineTo(bx, by);
-          context.stroke();
-        });
-      }
-      for (const [colour, thick] of [[ground, 3], [ink, 1]]) {
-        [context.strokeStyle, context.lineWidth] = [colour, thick];
-        context.beginPath();
-        context.moveTo(px - 9, py);
-        context.lineTo(px + 9, py);
-        context.moveTo(px, py - 9);
-        context.lineTo(px, py + 9);
-        context.stroke();
-      }
+    if (of) {
+      const image = document.createElement("canvas");
+      [image.width, image.height] = [canvas.width, canvas.height];
+      image.getContext("2d").drawImage(canvas, 0, 0);
+      drawn.set(canvas, { of, key, image, view });
     }
+    if (mark) cross(context, view, mark, { isPinned, offset, top, w, h, ink, ground });
     return view;
+  }
+
+  /** The mark of a place, and the two sections through it where somebody put it. */
+  function cross(context, view, mark, { isPinned, offset, top, w, h, ink, ground }) {
+    const [px, py] = view.toPage(...mark);
+    if (px < offset || px > offset + w || py < top || py > top + h) return;
+    if (isPinned) {
+      const style = getComputedStyle(document.documentElement);
+      [[offset, py, offset + w, py], [px, top, px, top + h]].forEach(([ax, ay, bx, by], k) => {
+        [context.strokeStyle, context.lineWidth] = [style.getPropertyValue(["--pv", "--rms"][k]).trim(), 1.4];
+        context.beginPath();
+        context.moveTo(ax, ay);
+        context.lineTo(bx, by);
+        context.stroke();
+      });
+    }
+    for (const [colour, thick] of [[ground, 3], [ink, 1]]) {
+      [context.strokeStyle, context.lineWidth] = [colour, thick];
+      context.beginPath();
+      context.moveTo(px - 9, py);
+      context.lineTo(px + 9, py);
+      context.moveTo(px, py - 9);
+      context.lineTo(px, py + 9);
+      context.stroke();
+    }
+  }
+
+  /** How much of a path is drawn behind the wheel over a map, so that the map is seen. */
+  const TRAIL_SHARE = 0.02;
+
+  /**
+   * The path of the wheel: what is ground in the colour of what is on, the rest quiet, and the wheel where it is. Over a
+   * map only the last tracks are drawn.
+   */
+  function wheelPath(context, view, { points, share }, { quiet, ground, area: [left, top, w, h], isOver }) {
+    const accent = getComputedStyle(document.documentElement).getPropertyValue("--accent").trim();
+    const at = placeOnPath(points, share);
+    const lines = (from, to, colour, alpha) => {
+      [context.strokeStyle, context.lineWidth, context.globalAlpha] = [colour, 1, alpha];
+      context.beginPath();
+      let isDown = false;
+      for (let k = from; k < to; k += 3) {
+        if (Number.isNaN(points[k])) isDown = false;
+        else if (isDown) context.lineTo(...view.toPage(points[k], points[k + 1]));
+        else [isDown] = [true, context.moveTo(...view.toPage(points[k], points[k + 1]))];
+      }
+      if (at && to === at.index && isDown) context.lineTo(...view.toPage(...at.place));
+      context.stroke();
+      context.globalAlpha = 1;
+    };
+    if (!isOver) lines(at ? Math.max(at.index - 3, 0) : 0, points.length, quiet, 0.2);
+    if (!at) return;
+    const trail = isOver ? placeOnPath(points, share - TRAIL_SHARE) : null;
+    lines(trail ? Math.max(trail.index - 3, 0) : 0, at.index, accent, isOver ? 0.8 : 0.45);
+    const [qx, qy] = view.toPage(...at.place);
+    // In its run-up the wheel is beside the part.
+    const [px, py] = [Math.min(Math.max(qx, left), left + w), Math.min(Math.max(qy, top), top + h)];
+    for (const [colour, radius] of [[ground, 9], [accent, 7]]) {
+      context.fillStyle = colour;
+      context.beginPath();
+      context.arc(px, py, radius, 0, 7);
+      context.fill();
+    }
+  }
+
+  /** The place at a share of a path, and the index of the point after it; null before the path begins. */
+  function placeOnPath(points, share) {
+    let [low, high] = [0, points.length / 3];
+    const shareAt = (k) => {
+      let j = k;
+      while (j < points.length / 3 && Number.isNaN(points[3 * j + 2])) j += 1;
+      return j < points.length / 3 ? points[3 * j + 2] : Infinity;
+    };
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (shareAt(middle) < share) low = middle + 1;
+      else high = middle;
+    }
+    while (low < points.length / 3 && Number.isNaN(points[3 * low])) low += 1;
+    if (low >= points.length / 3) low = points.length / 3 - 1;
+    const [x, y, end] = points.subarray(3 * low, 3 * low + 3);
+    const [u, v, begin] = low > 0 ? points.subarray(3 * low - 3, 3 * low) : [NaN, NaN, NaN];
+    if (Number.isNaN(u) || !(end > begin)) return Number.isNaN(x) ? null : { place: [x, y], index: 3 * low };
+    const part = Math.min(Math.max((share - begin) / (end - begin), 0), 1);
+    return { place: [u + part * (x - u), v + part * (y - v)], index: 3 * low };
   }
 
   /** The lowest and the highest value, each with a cross and its number. */
@@ -242,8 +331,16 @@ const regrindMap = (() => {
 
   /** Points as discs; those of no colour are hollow. */
   function discs(context, view, dots, { ground, ink, quiet }) {
-    for (const { at, size, rgb } of dots) {
+    for (const { at, size, rgb, pitch } of dots) {
       const [px, py] = view.toPage(...at);
+      if (pitch) {
+        // A place that stands for its surroundings: so the map grows while it is measured.
+        const [qx] = view.toPage(at[0] + pitch, at[1]);
+        const side = Math.max(qx - px, 2 * size);
+        context.fillStyle = `rgb(${rgb})`;
+        context.fillRect(px - side / 2, py - side / 2, side + 0.5, side + 0.5);
+        continue;
+      }
       context.beginPath();
       context.arc(px, py, size, 0, 7);
       [context.fillStyle, context.strokeStyle] = [rgb ? `rgb(${rgb})` : ground, rgb ? ink : quiet];
@@ -258,9 +355,10 @@ const regrindMap = (() => {
     const [wide, high] = [w, h].map((size) => Math.max(1, Math.round(size * fine)));
     const image = new ImageData(wide, high);
     const pixels = new Uint32Array(image.data.buffer);
-    for (const { at, size, rgb } of dots) {
+    for (const { at, size, rgb, pitch } of dots) {
       const [px, py] = view.toPage(...at);
-      const side = Math.max(1, Math.round((rgb ? 1.2 : 0.6) * size * fine));
+      const grown = pitch ? Math.ceil((view.toPage(at[0] + pitch, at[1])[0] - px) * fine) : 0;
+      const side = Math.max(1, grown, Math.round((rgb ? 1.2 : 0.6) * size * fine));
       const [column, row] = [(px - left) * fine, (py - top) * fine].map((middle) => Math.round(middle - side / 2));
       // Alpha, blue, green, red: as the bytes of a pixel lie on every machine that browsers run on.
       const colour = rgb ? (0xff000000 | (rgb[2] << 16) | (rgb[1] << 8) | rgb[0]) >>> 0 : 0xff909090;
@@ -383,5 +481,5 @@ const regrindMap = (() => {
     context.fillStyle = ink;
   }
 
-  return { sections, readGrid, readColours, statistics, roundLimit, levelled, difference, frameOf, draw, histogram, level };
+  return { bounds, sections, readGrid, readColours, statistics, roundLimit, levelled, difference, frameOf, draw, histogram, level };
 })();

@@ -91,7 +91,7 @@
     }
     tellAge();
     const names = (of) => JSON.stringify(of.cycles);
-    const touches = (of) => JSON.stringify([of.touched, of.deviations]);
+    const touches = (of) => JSON.stringify([of.touched, of.deviations, of.ground]);
     if (names(before) !== names(state) || touches(before) !== touches(state)) chooseCycle();
   }
 
@@ -196,20 +196,25 @@
   scales.addEventListener("change", update);
   const isCompared = () => view === "difference" || view === "sigma";
   cycles.addEventListener("change", () => {
-    chosen = cycles.value === "" ? null : Number(cycles.value);
+    chosen = cycles.value === "" || cycles.value === LIVE ? null : Number(cycles.value);
     update();
   });
 
-  /** Lists the cycles that have a map; the last one is shown unless somebody chose another. */
+  /** The choice of the map that grows while the CMM gives its points. */
+  const LIVE = "live";
+  const isLive = () => state.touched && state.deviations[2] > 0 && !state.cycles.some((of) => of.map && of.cycle === state.cycle);
+
+  /** Lists the cycles that have a map; the one that is measured, or the last one, is shown unless somebody chose another. */
   function chooseCycle() {
     const mapped = state.cycles.filter((of) => of.map);
-    const wanted = mapped.map((of) => String(of.cycle));
-    if ([...cycles.options].map((option) => option.value).join() !== wanted.join()) {
-      cycles.replaceChildren(...wanted.map((cycle) => new Option(cycle, cycle)));
+    const wanted = mapped.map((of) => [String(of.cycle), String(of.cycle)]);
+    if (isLive()) wanted.push([`${state.cycle} …`, LIVE]);
+    if ([...cycles.options].map((option) => option.value + option.text).join() !== wanted.map(([text, value]) => value + text).join()) {
+      cycles.replaceChildren(...wanted.map(([text, value]) => new Option(text, value)));
     }
-    const last = mapped.length ? mapped[mapped.length - 1].cycle : null;
-    cycles.value = String(mapped.some((of) => of.cycle === chosen) ? chosen : last);
-    cycles.disabled = !mapped.length;
+    const last = isLive() ? LIVE : mapped.length ? String(mapped[mapped.length - 1].cycle) : "";
+    cycles.value = mapped.some((of) => of.cycle === chosen) ? String(chosen) : last;
+    cycles.disabled = !wanted.length;
     update();
   }
 
@@ -250,7 +255,8 @@
     }
     if (grid && view === "sigma") grid = { ...grid, values: grid.sigma, low: 0 };
     const limit = grid ? await limitOf(grid, mapped) : 1;
-    return { grid, limit, missing, ...await dotsOver(grid, limit, at < 0 ? null : mapped[at]) };
+    const path = view === "map" || view === "sigma" ? await pathOfWheel() : null;
+    return { grid, limit, missing, path, ...await dotsOver(grid, limit, at < 0 ? null : mapped[at]) };
   }
 
   /** The points of the plan until there is a map, or those of the cycle where somebody wants them. */
@@ -297,6 +303,14 @@
     return live;
   }
 
+  /** The scale of the map that grows: that of the other maps where there is one. */
+  async function limitOfTouches(values) {
+    const mapped = state.cycles.filter((of) => of.map);
+    if (scales.value === "tolerance" && state.toleranceUm) return state.toleranceUm / 2;
+    const first = scales.value === "first" && mapped.length ? await mapOf(run, mapped[0].cycle, mapped[0].map) : null;
+    return regrindMap.roundLimit(regrindMap.statistics(first ? first.values : values).limit);
+  }
+
   /** The points of the plan, and over them what was touched, in the colour of its deviation. */
   async function dotsOfPlan(limitOfMap) {
     planned = planned || await bytes(`${base}/planned`);
@@ -308,7 +322,7 @@
     // A batch of chosen touches is drawn over the map of those before it only once it is known.
     if (limitOfMap && !known.deviations.length && total < count) return null;
     const values = regrindMap.levelled(known.places, known.deviations);
-    const dotLimit = limitOfMap || regrindMap.roundLimit(regrindMap.statistics(values).limit);
+    const dotLimit = limitOfMap || await limitOfTouches(values);
     const ink = getComputedStyle(document.body).color.match(/\d+/g).slice(0, 3).map(Number);
     const hues = Array.from({ length: 255 }, (_, k) => (view === "sigma" && limitOfMap ? [255, 255, 255] : Array.from(colours.subarray(3 * k, 3 * k + 3))));
     // A machine that gives no points before the end touches the reference sphere first, and then the part in the order of the plan.
@@ -318,8 +332,9 @@
       const isTouched = k < inOrder;
       dots.push({ at: [places[2 * k], places[2 * k + 1]], size: isTouched ? 2.6 : 1.4, rgb: isTouched ? ink : null });
     }
+    const pitch = limitOfMap ? 0 : pitchOf(places);
     values.forEach((value, k) => {
-      if (!Number.isNaN(value)) dots.push({ at: [known.places[2 * k], known.places[2 * k + 1]], size: 2.8, rgb: hues[regrindMap.level(value, dotLimit)] });
+      if (!Number.isNaN(value)) dots.push({ pitch, at: [known.places[2 * k], known.places[2 * k + 1]], size: 2.8, rgb: hues[regrindMap.level(value, dotLimit)] });
     });
     const touched = known.deviations.length || inOrder;
     const words = touched ? [`● ${texts.touched} ${number(touched, 0)}`] : [];
@@ -328,20 +343,78 @@
     return { dots, key: words.join(" · "), dotLimit: values.length && !limitOfMap ? dotLimit : null };
   }
 
+  /** How far apart the points of a plan are, if they lie evenly. */
+  function pitchOf(places) {
+    const count = places.length / 2;
+    let [x0, y0, x1, y1] = [Infinity, Infinity, -Infinity, -Infinity];
+    for (let k = 0; k < places.length; k += 2) {
+      [x0, y0, x1, y1] = [Math.min(x0, places[k]), Math.min(y0, places[k + 1]), Math.max(x1, places[k]), Math.max(y1, places[k + 1])];
+    }
+    // A little more than the distance of even points, so that rows of another distance leave no gaps.
+    return count > 1 ? 1.15 * Math.sqrt(((x1 - x0) * (y1 - y0)) / count) : 0;
+  }
+
+  /** The path of the wheel and the share of it that is ground, while a pass runs. */
+  let wheelPoints = null;
+  async function pathOfWheel() {
+    if (!state.ground) return null;
+    wheelPoints = wheelPoints || await bytes(`${base}/path`);
+    const [done, total] = state.ground;
+    return wheelPoints && total ? { points: new Float32Array(wheelPoints), share: done / total } : null;
+  }
+
+  /** The part of the part that is shown: its bounds in millimetres; null for the whole. */
+  let zoom = null;
+  function wholeFrame() {
+    if (!current) return null;
+    const places = (current.dots || []).map((dot) => dot.at);
+    return current.grid || places.length ? regrindMap.bounds(current.grid, places) : null;
+  }
+
+  /** Shows a part of the map that is larger by a factor, around a place that keeps where it is. */
+  function zoomBy(factor, place) {
+    const whole = wholeFrame();
+    if (!whole) return;
+    const [x0, y0, x1, y1] = zoom || whole;
+    const [x, y] = place || [(x0 + x1) / 2, (y0 + y1) / 2];
+    const next = [x + (x0 - x) / factor, y + (y0 - y) / factor, x + (x1 - x) / factor, y + (y1 - y) / factor];
+    zoom = next[2] - next[0] >= whole[2] - whole[0] ? null : next[2] - next[0] < (whole[2] - whole[0]) / 64 ? zoom : within(next, whole);
+    paint();
+  }
+
+  /** The same frame, moved so that it lies within the whole. */
+  function within([x0, y0, x1, y1], [wx0, wy0, wx1, wy1]) {
+    const [dx, dy] = [Math.max(wx0 - x0, 0) + Math.min(wx1 - x1, 0), Math.max(wy0 - y0, 0) + Math.min(wy1 - y1, 0)];
+    return [x0 + dx, y0 + dy, x1 + dx, y1 + dy];
+  }
+
+  function panBy(dx, dy) {
+    if (!zoom) return;
+    zoom = within([zoom[0] + dx, zoom[1] + dy, zoom[2] + dx, zoom[3] + dy], wholeFrame());
+    paint();
+  }
+
+  document.querySelectorAll("[data-zoom]").forEach((button) => button.addEventListener("click", () => {
+    if (button.dataset.zoom === "whole") {
+      zoom = null;
+      paint();
+    } else zoomBy(button.dataset.zoom === "in" ? 2 : 0.5, isPinned ? mark : null);
+  }));
+
   let seen = null;
   function paint() {
     if (!current) return;
-    const { grid, limit, dots, missing, dotLimit } = current;
+    const { grid, limit, dots, path, missing, dotLimit } = current;
     const hues = grid && grid.low === 0 ? unsigned : colours;
     const asRelief = view === "relief" && grid;
     if (asRelief && solid === undefined) solid = regrindRelief.prepare(relief, element("frame"));
     const drawnSolid = asRelief && solid;
     [canvas.hidden, relief.hidden, element("frame").hidden] = [Boolean(drawnSolid), !drawnSolid, !drawnSolid];
     if (drawnSolid) solid.show(grid, limit, colours);
-    else seen = regrindMap.draw(canvas, { grid, limit: dotLimit || limit, colours: hues, dots, mark, missing, isPinned, hasBar: Boolean(grid || dotLimit), most: Math.max(280, innerHeight - 400) });
+    else seen = regrindMap.draw(canvas, { of: current, frame: zoom, grid, limit: dotLimit || limit, colours: hues, dots, path, mark, missing, isPinned, hasBar: Boolean(grid || dotLimit), most: Math.max(280, innerHeight - 400) });
     scales.disabled = isCompared();
     scales.querySelector("[value=tolerance]").disabled = !state.toleranceUm;
-    element("saved").hidden = cycles.value === "";
+    element("saved").hidden = cycles.value === "" || cycles.value === LIVE;
     for (const link of document.querySelectorAll("[data-file]")) link.href = `${base}/cycles/${cycles.value}/files/${link.dataset.file}`;
     // What is shown decides how wide each picture is.
     const hasSections = Boolean(grid && mark && isPinned && !drawnSolid);
@@ -359,9 +432,10 @@
     const { grid, key } = current;
     const extent = grid && { wide: grid.columns * grid.stepX, deep: grid.rows * grid.stepY, limit: current.limit };
     const help = !relief.hidden && grid ? [`${texts.heights} × ${number(regrindRelief.heightFactor(extent), 0)}`] : isPinned ? [] : [texts.sectionHelp];
+    const walked = current.path ? [`● ${texts.wheel} ${number(100 * current.path.share, 0)} %`] : [];
     caption.textContent = grid
-      ? [`${number(grid.columns * grid.stepX, 0)} × ${number(grid.rows * grid.stepY, 0)} mm`, ...(grid.low < 0 ? [texts.sign] : []), ...help].join(" · ")
-      : key || "";
+      ? [...walked, `${number(grid.columns * grid.stepX, 0)} × ${number(grid.rows * grid.stepY, 0)} mm`, ...(grid.low < 0 ? [texts.sign] : []), ...help].join(" · ")
+      : [...walked, ...(key ? [key] : [])].join(" · ");
     if (instead || !grid) {
       reading.textContent = instead || "";
       return;
@@ -394,14 +468,35 @@
     mark = seen.toPart(event.clientX - box.left, event.clientY - box.top);
     paint();
   }
-  canvas.addEventListener("pointerdown", () => { isDragged = isPinned; });
-  // A finger that scrolls the page gives no click.
+  /** Where a pan began: the place of the part under the pointer. */
+  let panned = null;
+  let hasPanned = false;
+  const placeOf = (event) => {
+    const box = canvas.getBoundingClientRect();
+    return seen.toPart(event.clientX - box.left, event.clientY - box.top);
+  };
+  canvas.addEventListener("pointerdown", (event) => {
+    isDragged = isPinned;
+    [panned, hasPanned] = [zoom && seen && !isPinned ? placeOf(event) : null, false];
+  });
+  canvas.addEventListener("wheel", (event) => {
+    if (!event.ctrlKey || !seen) return;
+    event.preventDefault();
+    zoomBy(event.deltaY < 0 ? 1.25 : 0.8, placeOf(event));
+  }, { passive: false });
+  // A finger that scrolls the page gives no click, and a pan pins nothing.
   canvas.addEventListener("click", (event) => {
+    if (hasPanned) return;
     isPinned = Boolean(current && current.grid);
     moveMark(event);
   });
-  for (const end of ["pointerup", "pointercancel"]) addEventListener(end, () => { isDragged = false; });
+  for (const end of ["pointerup", "pointercancel"]) addEventListener(end, () => { [isDragged, panned] = [false, null]; });
   canvas.addEventListener("pointermove", (event) => {
+    if (panned && event.buttons) {
+      const [x, y] = placeOf(event);
+      hasPanned = true;
+      return panBy(panned[0] - x, panned[1] - y);
+    }
     if (isDragged || !isPinned) moveMark(event);
   });
   canvas.addEventListener("pointerleave", () => {
@@ -420,8 +515,15 @@
       [isPinned, mark] = [false, null];
       paint();
     }
+    const closer = { "+": 2, "=": 2, "-": 0.5 }[event.key];
+    if (closer) zoomBy(closer, mark);
+    if (event.key === "0") {
+      zoom = null;
+      paint();
+    }
     if (!step || !grid) return;
     event.preventDefault();
+    if (event.shiftKey && zoom) return panBy(step[0] * 0.1 * (zoom[2] - zoom[0]), step[1] * 0.1 * (zoom[3] - zoom[1]));
     isPinned = true;
     const middle = [grid.firstX + grid.stepX * (grid.columns >> 1), grid.firstY + grid.stepY * (grid.rows >> 1)];
     mark = (mark || middle).map((place, k) => place + step[k] * (k ? grid.stepY : grid.stepX));
