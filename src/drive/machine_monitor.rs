@@ -63,7 +63,7 @@ fn hull([a_low, a_high]: [f64; 2], [b_low, b_high]: [f64; 2]) -> [f64; 2] {
     [a_low.min(b_low), a_high.max(b_high)]
 }
 
-/// What is known of a machine.
+/// Last status of a machine with the courses of its values.
 struct Observed {
     /// Status without the courses of its values.
     status: MachineStatus,

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use regrind_cell::Alarm;
 
-use super::language::{AlarmEntry, Language};
+use regrind_language::{AlarmEntry, Language};
 
 /// Texts of an alarm in one language.
 pub(crate) struct AlarmTexts<'a> {

@@ -5,8 +5,8 @@ use maud::{Markup, PreEscaped, html};
 use regrind_cell::Tolerance;
 use regrind_report::{Chart, ChartAxis, CycleSummary, Dot, Layer, Mark, Scale, Shape};
 
-use super::language::{Language, decimal};
 use super::texts::Text;
+use regrind_language::{Language, decimal};
 
 /// Width and height of the chart, and the space to the right of its axes, in pixels.
 const SIZE: [f64; 2] = [420.0, 190.0];

@@ -2,8 +2,8 @@
 
 use maud::{Markup, html};
 
-use super::language::{Language, decimal};
 use super::texts::Text;
+use regrind_language::{Language, decimal};
 
 /// Width of the bar in the units of its picture.
 const WIDTH: f64 = 400.0;

@@ -19,7 +19,6 @@ mod gauge;
 mod guard;
 mod guarded_server;
 mod history;
-mod language;
 mod live;
 mod machines_view;
 mod operator_step;

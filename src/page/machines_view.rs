@@ -11,12 +11,12 @@ use regrind_report::{Chart, ChartAxis, CycleSummary, Layer, Mark, RunSummary, Sc
 use tokio::task::spawn_blocking;
 
 use super::guard::Session;
-use super::language::{Language, decimal};
 use super::pieces::in_path;
 use super::shared::{Equipment, Shared};
 use super::subject::PageSubject;
 use super::texts::Text;
 use super::view::{first_run, language, not_here, plain_document};
+use regrind_language::{Language, decimal};
 
 /// Width and height of the chart of a value, in pixels.
 const CHART: [f64; 2] = [400.0, 120.0];

@@ -13,9 +13,9 @@ use regrind_formats::operator_step::{OperatorAction, OperatorStep, RequiredPoint
 use tokio::task::spawn_blocking;
 
 use super::attachment::attachment;
-use super::language::{Language, shortest};
 use super::shared::Shared;
 use super::texts::Text;
+use regrind_language::{Language, shortest};
 
 /// Returns the HTML of the step `step` of the machine `device`. `run` is the address of the run.
 pub(crate) fn card(step: &OperatorStep, device: Device, run: &str, language: Language) -> Markup {

@@ -13,12 +13,12 @@ use tokio::task::spawn_blocking;
 
 use super::guard::Session;
 use super::history::Listed;
-use super::language::{Language, decimal};
 use super::pieces::{in_path, when};
 use super::shared::Shared;
 use super::subject::PageSubject;
 use super::texts::{self, Text};
 use super::view::{language, not_here, plain_document};
+use regrind_language::{Language, decimal};
 
 /// Serves the list of the parts with a serial number, from the one that was made last.
 pub(crate) async fn parts(

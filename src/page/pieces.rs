@@ -9,10 +9,10 @@ use regrind_report::{AlarmAcknowledgement, AlarmHistory, CycleSummary, RunResult
 use super::alarms::alarm_texts;
 use super::chart::chart;
 use super::gauge::gauge;
-use super::language::{Language, decimal};
 use super::live::ObservedRun;
 use super::operator_step;
 use super::texts::{self, Text};
+use regrind_language::{Language, decimal};
 
 /// Piece of the page of a run, which is updated on its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -11,12 +11,12 @@ use serde::Deserialize;
 use tokio::task::spawn_blocking;
 
 use super::guard::Session;
-use super::language::Language;
 use super::pieces::{in_path, when};
 use super::shared::Shared;
 use super::subject::PageSubject;
 use super::texts::Text;
 use super::view::{language, not_here, plain_document};
+use regrind_language::Language;
 
 /// Number of records on a page.
 const COUNT: usize = 100;

@@ -8,10 +8,10 @@ use axum::response::Response;
 use maud::html;
 
 use super::guard::Session;
-use super::language::Language;
 use super::shared::Shared;
 use super::texts::{self, Text};
 use super::view::{THEMES, language, plain_document};
+use regrind_language::Language;
 
 /// Serves the settings. The list of the users is for engineers only.
 pub(crate) async fn settings(

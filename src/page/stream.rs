@@ -13,12 +13,12 @@ use serde_json::{Map, Value, json};
 use tokio::sync::watch::Receiver;
 
 use super::guard::Session;
-use super::language::Language;
 use super::live::ObservedRun;
 use super::pieces::{Piece, run_pieces};
 use super::shared::Shared;
 use super::view;
 use super::viewers::Viewer;
+use regrind_language::Language;
 
 /// Maximum time between two messages of the stream. A browser that gets no message for longer shows that its figures
 /// are old.

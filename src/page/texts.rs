@@ -5,31 +5,13 @@ use regrind_cell::{Device, JobStep, Phase, StateName};
 use regrind_control::NextStep;
 use regrind_report::RunResult;
 
-use super::language::Language;
 use super::users::PageRole;
+use regrind_language::Language;
 
-macro_rules! texts {
-    ($($name:ident)+) => {
-        /// Text of the page.
-        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-        pub(crate) enum Text {
-            $($name,)+
-        }
-
-        impl Text {
-            #[cfg(test)]
-            const ALL: &[Self] = &[$(Self::$name),+];
-
-            /// Returns this text in `language`.
-            pub(crate) fn to(self, language: Language) -> &'static str {
-                language.text([$(stringify!($name)),+][self as usize])
-            }
-        }
-    };
-}
-
-// The texts themselves are in `languages/`.
-texts! {
+// The texts themselves are in the files of the languages.
+regrind_language::texts! {
+    /// Text of the page.
+    Text in Page:
     // The frame of the page.
     Cell Runs Parts Machines Settings Components Record ShiftLog Events NewEntry AddEntry Time Who Kind What Older RecordIntact SignedUpTo NotSigned RecordBroken
     Compare Language Appearance AsTheSystem Light Dark HighContrast SkipToOrders Simulation

@@ -20,13 +20,13 @@ use tokio::task::spawn_blocking;
 use super::chart::chart;
 use super::guard::{Denied, Session, text};
 use super::history::Listed;
-use super::language::{Language, decimal};
 use super::live::{ObservedRun, verdict};
 use super::pieces::{Piece, about, banner, figures, in_path, is_over, lacks_reason, run_pieces, verdict_reason, when};
 use super::shared::Shared;
 use super::subject::PageSubject;
 use super::texts::{self, Text};
 use super::users::Person;
+use regrind_language::{Language, decimal};
 
 /// Returns the state of a run as JSON for the scripts of the page. `seen` is the current status of the run. `session`
 /// decides which orders are allowed. `has_control` is true if the browser has control of the cell, or if no browser has

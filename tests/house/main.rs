@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// Every room, its folder or file, and the rooms that it may name. A dependency that is not in a line here points in
 /// the wrong direction.
-const ARROWS: [(&str, &str, &[&str]); 26] = [
+const ARROWS: [(&str, &str, &[&str]); 27] = [
     ("figures", "src/figures", &[]),
     ("geometry", "src/core/geometry", &[]),
     ("surface", "src/core/surface", &["geometry"]),
@@ -34,8 +34,9 @@ const ARROWS: [(&str, &str, &[&str]); 26] = [
     ("live", "src/live", &["cell", "control", "document", "formats", "trust"]),
     ("plant", "src/plant", &["document", "formats", "journal", "page", "report", "trust"]),
     ("record", "src/record", &["cell", "formats", "journal"]),
-    ("report", "src/report", &["cell", "journal", "formats", "geometry", "record", "registration"]),
-    ("page", "src/page", &["cell", "control", "document", "formats", "report"]),
+    ("language", "src/language", &["cell"]),
+    ("report", "src/report", &["cell", "journal", "formats", "geometry", "language", "record", "registration"]),
+    ("page", "src/page", &["cell", "control", "document", "formats", "language", "report"]),
     (
         "drive",
         "src/drive",
@@ -287,8 +288,16 @@ fn crates_depend_downwards_only() {
         ("src/control/Cargo.toml", &["regrind-cell", "regrind-document", "regrind-formats", "regrind-windows"]),
         (
             "src/page/Cargo.toml",
-            &["regrind-cell", "regrind-control", "regrind-document", "regrind-formats", "regrind-report"],
+            &[
+                "regrind-cell",
+                "regrind-control",
+                "regrind-document",
+                "regrind-formats",
+                "regrind-language",
+                "regrind-report",
+            ],
         ),
+        ("src/language/Cargo.toml", &["regrind-cell"]),
         ("src/trust/Cargo.toml", &["regrind-formats"]),
         (
             "src/live/Cargo.toml",
@@ -315,6 +324,7 @@ fn crates_depend_downwards_only() {
                 "regrind-figures",
                 "regrind-formats",
                 "regrind-journal",
+                "regrind-language",
                 "regrind-record",
             ],
         ),
@@ -430,7 +440,7 @@ fn functions_read_names_and_lines() {
 }
 
 /// Root files of the crates.
-const CRATES: [&str; 22] = [
+const CRATES: [&str; 23] = [
     "sim/lib.rs",
     "src/cell/lib.rs",
     "src/control/lib.rs",
@@ -440,6 +450,7 @@ const CRATES: [&str; 22] = [
     "src/figures/lib.rs",
     "src/formats/lib.rs",
     "src/journal/lib.rs",
+    "src/language/lib.rs",
     "src/lib.rs",
     "src/live/lib.rs",
     "src/main.rs",

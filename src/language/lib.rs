@@ -1,4 +1,8 @@
-//! Languages of the page. Each language has one file in `languages/` with all its texts.
+//! Languages of the page and of the report. Each language has one file in `languages/` with all its texts.
+//!
+//! ```text
+//!  languages/en.toml --> Catalogue --> Language::text(section, name) --> an enum of the names, made by texts! --> page, report
+//! ```
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::LazyLock;
@@ -8,17 +12,19 @@ use serde::Deserialize;
 
 macro_rules! languages {
     ($($(#[$default:meta])? $id:ident $tag:literal)+) => {
-        /// Language of the page.
+        /// Language of a reader.
+        #[expect(missing_docs, reason = "each is named by its tag")]
         #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
-        pub(crate) enum Language {
+        pub enum Language {
             $($(#[$default])? $id,)+
         }
 
         impl Language {
-            pub(crate) const ALL: &[Self] = &[$(Self::$id),+];
+            /// All languages.
+            pub const ALL: &[Self] = &[$(Self::$id),+];
 
             /// Returns the language tag for HTML and browsers, such as `en`.
-            pub(crate) fn tag(self) -> &'static str {
+            pub fn tag(self) -> &'static str {
                 [$($tag),+][self as usize]
             }
 
@@ -45,15 +51,52 @@ languages! {
     Zh "zh"
 }
 
+/// Section of the texts of a language.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Section {
+    /// Texts of the page.
+    Page,
+    /// Texts of the report.
+    Report,
+}
+
+/// Makes an enum of texts, with the section in which the files of the languages have them.
+///
+/// ```text
+/// regrind_language::texts! { Text in Page: Cell Runs Parts }
+/// Text::Cell.to(Language::De)
+/// ```
+#[macro_export]
+macro_rules! texts {
+    ($(#[$doc:meta])* $enum:ident in $section:ident: $($name:ident)+) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        pub(crate) enum $enum {
+            $($name,)+
+        }
+
+        impl $enum {
+            #[cfg(test)]
+            const ALL: &[Self] = &[$(Self::$name),+];
+
+            /// Returns this text in `language`.
+            pub(crate) fn to(self, language: $crate::Language) -> &'static str {
+                language.text($crate::Section::$section, [$(stringify!($name)),+][self as usize])
+            }
+        }
+    };
+}
+
 /// Texts of an alarm in a language other than English, the language of the record.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct AlarmEntry {
+pub struct AlarmEntry {
     /// General description of the event. The values of the alarm follow it.
-    pub(crate) event: String,
-    pub(crate) consequence: String,
+    pub event: String,
+    /// Its consequence.
+    pub consequence: String,
     /// Steps of the remedy, in this order.
-    pub(crate) remedy: Vec<String>,
+    pub remedy: Vec<String>,
 }
 
 /// Texts of one language.
@@ -64,6 +107,9 @@ struct Catalogue {
     decimal_sign: String,
     /// Texts of the page. The keys have the names of the variants of `Text`.
     page: HashMap<String, String>,
+    /// Texts of the report. The keys have the names of the variants of `ReportText`.
+    #[serde(default)]
+    report: HashMap<String, String>,
     #[serde(default)]
     alarms: BTreeMap<AlarmId, AlarmEntry>,
 }
@@ -71,7 +117,9 @@ struct Catalogue {
 impl Catalogue {
     fn read(text: &str) -> Result<Self, toml::de::Error> {
         let mut catalogue: Self = toml::from_str(text)?;
-        catalogue.page = catalogue.page.into_iter().map(|(key, text)| (variant_name(&key), text)).collect();
+        for section in [&mut catalogue.page, &mut catalogue.report] {
+            *section = section.drain().map(|(key, text)| (variant_name(&key), text)).collect();
+        }
         Ok(catalogue)
     }
 }
@@ -87,25 +135,30 @@ fn variant_name(key: &str) -> String {
 
 impl Language {
     /// Returns the name of the language in the language itself.
-    pub(crate) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         &self.catalogue().name
     }
 
-    /// Returns the text of the page with the name `name`, such as `NotConnected`. Tests hold that every language has
+    /// Returns the text with the name `name`, such as `NotConnected`, in a section. Tests hold that every language has
     /// every text.
-    pub(crate) fn text(self, name: &str) -> &'static str {
-        self.catalogue().page.get(name).map_or("", String::as_str)
+    pub fn text(self, section: Section, name: &str) -> &'static str {
+        let catalogue = self.catalogue();
+        let texts = match section {
+            Section::Page => &catalogue.page,
+            Section::Report => &catalogue.report,
+        };
+        texts.get(name).map_or("", String::as_str)
     }
 
     /// Returns the texts of an alarm. Returns `None` if the language has none: then the texts of the record are used.
-    pub(crate) fn alarm(self, id: AlarmId) -> Option<&'static AlarmEntry> {
+    pub fn alarm(self, id: AlarmId) -> Option<&'static AlarmEntry> {
         self.catalogue().alarms.get(&id)
     }
 
     /// Returns the first language in `tags` that the page supports. `tags` is a list separated by commas, such as the
     /// value of the header `Accept-Language`. The order of the list decides; weights such as `q=0.5` are ignored.
     /// Returns `None` if the page supports none of the languages.
-    pub(crate) fn first_of(tags: &str) -> Option<Self> {
+    pub fn first_of(tags: &str) -> Option<Self> {
         tags.split(',').find_map(|tag| {
             let primary = tag.trim().split(['-', ';', '_']).next()?.to_ascii_lowercase();
             Self::ALL.iter().copied().find(|language| language.tag() == primary)
@@ -114,12 +167,12 @@ impl Language {
 }
 
 /// Formats a number with the given number of decimals, and with the decimal sign of `language`.
-pub(crate) fn decimal(value: f64, digits: usize, language: Language) -> String {
+pub fn decimal(value: f64, digits: usize, language: Language) -> String {
     format!("{value:.digits$}").replacen('.', &language.catalogue().decimal_sign, 1).replacen('-', "\u{2212}", 1)
 }
 
 /// Formats a number with all its decimals, and with the decimal sign of `language`.
-pub(crate) fn shortest(value: f64, language: Language) -> String {
+pub fn shortest(value: f64, language: Language) -> String {
     value.to_string().replacen('.', &language.catalogue().decimal_sign, 1)
 }
 
@@ -132,11 +185,13 @@ mod tests {
         let english = Catalogue::read(Language::En.file()).unwrap();
         for language in Language::ALL {
             let read = Catalogue::read(language.file()).unwrap_or_else(|error| panic!("{language:?}: {error}"));
-            for key in english.page.keys() {
-                assert!(read.page.get(key).is_some_and(|text| !text.trim().is_empty()), "{language:?} has no {key}");
-            }
-            for key in read.page.keys() {
-                assert!(english.page.contains_key(key), "{language:?}: {key} is in no other language");
+            for (english, read) in [(&english.page, &read.page), (&english.report, &read.report)] {
+                for key in english.keys() {
+                    assert!(read.get(key).is_some_and(|text| !text.trim().is_empty()), "{language:?} has no {key}");
+                }
+                for key in read.keys() {
+                    assert!(english.contains_key(key), "{language:?}: {key} is in no other language");
+                }
             }
             assert!(!read.name.is_empty() && read.decimal_sign.chars().count() == 1, "{language:?}");
         }
@@ -165,7 +220,7 @@ mod tests {
 
     #[test]
     fn numbers_have_sign_of_language() {
-        assert_eq!([decimal(1.25, 1, Language::De), decimal(-0.5, 2, Language::En)], ["1,2", "-0.50"]);
+        assert_eq!([decimal(1.25, 1, Language::De), decimal(-0.5, 2, Language::En)], ["1,2", "\u{2212}0.50"]);
         assert_eq!([shortest(1e-3, Language::De), shortest(12.0, Language::De)], ["0,001", "12"]);
     }
 }
