@@ -10,7 +10,7 @@ use regrind::journal::{
     Anchor, DATABASE, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Verified, verify_against,
 };
 use regrind::record::{Begin, RunContent, begin_of};
-use regrind::report::{run_report, words};
+use regrind::report::{report_language, run_report, words};
 use serde_json::json;
 
 use super::Outcome;
@@ -225,7 +225,10 @@ fn is_folder_of_runs(folder: &Path) -> bool {
 fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     let report = RunFile::Report.name();
     let edited = unrecorded.iter().any(|name| name == report)
-        && std::fs::read_to_string(folder.join(report)).ok() != run_report(folder).ok();
+        && std::fs::read_to_string(folder.join(report)).ok().is_none_or(|text| {
+            let language = report_language(&text).unwrap_or_default();
+            run_report(folder, language).ok().as_ref() != Some(&text)
+        });
     let others: Vec<&str> = unrecorded.iter().map(String::as_str).filter(|name| *name != report).collect();
     let report = if edited {
         format!(

@@ -95,7 +95,7 @@ impl RunContext<'_> {
         let ending = go(run, machines, actor).await?;
         let shown = showing.await.map_err(|e| Failure::Terminal(e.into()));
         // The record is closed. A failed report or a closed terminal must not change the result of the run.
-        let report = regrind::report::write_run_report(self.folder);
+        let report = regrind::report::write_run_report(self.folder, regrind::report::Language::En);
         shown??;
         if let Err(error) = report {
             super::print(&format!("the report was not written: {error}\n"))?;

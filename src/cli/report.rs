@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use regrind::report::{ResultsFormat, write_run_report, write_run_results};
+use regrind::report::{Language, ResultsFormat, write_run_report, write_run_results};
 
 use super::Outcome;
 use super::control::folder_of;
@@ -17,6 +17,7 @@ RUN/report.html. Results for other systems have each measurement with its figure
 
 Examples:
   regrind report runs/freeform-mirror-20260704T120000Z
+  regrind report runs/freeform-mirror-20260704T120000Z --language de
   regrind report runs/freeform-mirror-20260704T120000Z --qif --dfq=/srv/qdas/part-17.dfq
 
 Exit codes: 0 written; 1 the record is broken; 2 no such run, no record in it, nothing measured (with --qif or --dfq), or a file
@@ -31,14 +32,24 @@ pub(super) struct Arguments {
     /// Also write the results as Q-DAS ASCII, to FILE or to RUN/results.dfq
     #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
     dfq: Option<Option<PathBuf>>,
+    /// Language of the report: en, de or zh. Sentences of the record stay in its words
+    #[arg(long, value_name = "LANGUAGE", default_value = "en", value_parser = language)]
+    language: Language,
     /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }
 
+/// Reads the tag of a language of the report.
+fn language(text: &str) -> Result<Language, String> {
+    let tags: Vec<&str> = Language::ALL.iter().map(|language| language.tag()).collect();
+    let found = Language::ALL.iter().copied().find(|language| language.tag() == text);
+    found.ok_or_else(|| format!("this language does not exist; the languages are {}", tags.join(", ")))
+}
+
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let folder = folder_of(arguments.run.as_deref())?;
-    let mut written = vec![("report", write_run_report(&folder).map_err(Failure::Report)?)];
+    let mut written = vec![("report", write_run_report(&folder, arguments.language).map_err(Failure::Report)?)];
     let wanted = [("qif", ResultsFormat::Qif, &arguments.qif), ("dfq", ResultsFormat::Dfq, &arguments.dfq)];
     for (key, format, path) in wanted {
         if let Some(path) = path {

@@ -335,6 +335,8 @@ fn header(
             nominal_sha256: Some(HEXLOWER.encode(&task.part_identity)),
             setting: Some(task.setting.id.clone()),
             part_name: Some(recipe.part.name.clone()),
+            drawing: recipe.part.drawing.clone(),
+            material: recipe.part.material.clone(),
             part_in_files: Some(live.part.to_owned()),
             job: Some(live.job),
             seed: arguments.seed,

@@ -1,14 +1,11 @@
 //! Figure with its uncertainty and its limit: as a number, and as a bar that shows all three.
 
-use maud::{Markup, html};
+use maud::{Markup, PreEscaped, html};
+
+use regrind_report::interval_bar;
 
 use super::texts::Text;
 use regrind_language::{Language, decimal};
-
-/// Width of the bar in the units of its picture.
-const WIDTH: f64 = 400.0;
-/// Share of the width that the larger of the figure and the limit takes.
-const LARGEST_SHARE: f64 = 0.9;
 
 /// Returns the HTML of a figure. `value_um` has the figure and its expanded uncertainty, in micrometres. `limit_um` is
 /// the limit, if there is one. The bar begins at 0.
@@ -20,8 +17,6 @@ pub(crate) fn gauge(
     language: Language,
 ) -> Markup {
     let um = |value: f64| decimal(value, digits, language);
-    let bar = Bar::fitting([value_um, expanded_um], limit_um);
-    let is_beyond = limit_um.is_some_and(|limit_um| value_um + expanded_um > limit_um);
     let class = name.to_lowercase();
     html! {
         div .gauge .(class) {
@@ -31,41 +26,8 @@ pub(crate) fn gauge(
                 "± " (um(expanded_um)) " µm"
                 @if let Some(limit_um) = limit_um { " · " (Text::Limit.to(language)) " " (um(limit_um)) }
             }
-            svg viewBox=(format!("0 0 {WIDTH} 16")) preserveAspectRatio="none" aria-hidden="true" {
-                rect .track x="0" y="3" width=(WIDTH) height="10" {}
-                rect .value x="0" y="3" width=(bar.place(value_um)) height="10" {}
-                rect .uncertainty x=(bar.place(value_um - expanded_um)) y="5" width=(bar.width(value_um, expanded_um)) height="6" {}
-                @if let Some(limit_um) = limit_um {
-                    rect .limit .beyond[is_beyond] x=(bar.place(limit_um)) y="0" width="3" height="16" {}
-                }
-            }
+            (PreEscaped(interval_bar([value_um - expanded_um, value_um, value_um + expanded_um], limit_um)))
         }
-    }
-}
-
-/// Scale of the bar.
-struct Bar {
-    per_um: f64,
-}
-
-impl Bar {
-    fn fitting([value_um, expanded_um]: [f64; 2], limit_um: Option<f64>) -> Self {
-        let largest_um = (value_um + expanded_um).max(limit_um.unwrap_or(0.0));
-        let is_usable = largest_um > 0.0 && largest_um.is_finite();
-        Self { per_um: if is_usable { LARGEST_SHARE * WIDTH / largest_um } else { 0.0 } }
-    }
-
-    /// Returns the place of a value on the bar, as a number of the picture.
-    fn place(&self, um: f64) -> String {
-        let place = (um * self.per_um).clamp(0.0, WIDTH);
-        format!("{:.1}", if place.is_finite() { place } else { 0.0 })
-    }
-
-    /// Returns the width of the interval of a figure, as a number of the picture.
-    fn width(&self, value_um: f64, expanded_um: f64) -> String {
-        let [low, high] =
-            [value_um - expanded_um, value_um + expanded_um].map(|um| (um * self.per_um).clamp(0.0, WIDTH));
-        format!("{:.1}", if (high - low).is_finite() { high - low } else { 0.0 })
     }
 }
 

@@ -12,7 +12,7 @@ use regrind_cell::{Device, StateName};
 use regrind_control::{NextStep, Snapshot};
 use regrind_formats::operator_step::StepConfirmation;
 use regrind_formats::run_files::RunFile;
-use regrind_report::{ColourMap, RunResult};
+use regrind_report::{ColourMap, RunResult, report_language};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::task::spawn_blocking;
@@ -424,15 +424,20 @@ pub(crate) async fn compare(
     document(say(Text::Compare), &Frame { language, person: session.person.as_ref(), kind: Kind::WithMaps }, main)
 }
 
-/// Serves the report of the run named `id`. Uses the report file in the folder of the run. If there is no such file,
-/// creates the report from the record. Responds with the status 404 if the run does not exist, and 422 if the report
+/// Serves the report of the run named `id` in the language of the reader. Uses the report file in the folder of the run.
+/// If there is no such file, or if it has another language, creates the report from the record. Responds with the status 404 if the run does not exist, and 422 if the report
 /// cannot be created.
 pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, headers: HeaderMap) -> Response {
     drop(page.viewers.enter());
     let Some(folder) = page.history.folder(&id) else { return not_here(PageSubject::Cell, &headers) };
+    let language = language(&headers);
     let read = spawn_blocking(move || {
-        std::fs::read(folder.join(RunFile::Report.name()))
-            .or_else(|_| regrind_report::run_report(&folder).map(String::into_bytes))
+        let file = std::fs::read(folder.join(RunFile::Report.name())).ok();
+        let is_wanted = |html: &Vec<u8>| report_language(&String::from_utf8_lossy(html)) == Some(language);
+        match file.filter(is_wanted) {
+            Some(html) => Ok(html),
+            None => regrind_report::run_report(&folder, language).map(String::into_bytes),
+        }
     });
     match read.await {
         Ok(Ok(html)) => {

@@ -107,6 +107,12 @@ pub struct PartStart {
     /// Name of the part.
     #[serde(default, deserialize_with = "or_none")]
     pub part_name: Option<String>,
+    /// Number of the drawing of the part.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub drawing: Option<String>,
+    /// Material of the part.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub material: Option<String>,
     /// Name of the part in files and prompts.
     #[serde(default, deserialize_with = "or_none")]
     pub part_in_files: Option<String>,

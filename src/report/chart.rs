@@ -209,7 +209,7 @@ const LINE: f64 = 16.0;
 
 /// Colours for paper, of a chart in a file. The hues are those of Okabe and Ito, which people with colour blindness can
 /// distinguish; their yellow is left out because its contrast on white is too low.
-const PAPER: &str = "text{fill:#222;font-family:Helvetica,Arial,sans-serif;font-size:12px}.title{font-size:15px}.tick,.label{fill:#444}\
+pub(super) const PAPER: &str = "text{fill:#222;font-family:Helvetica,Arial,sans-serif;font-size:12px}.title{font-size:15px}.tick,.label{fill:#444}\
 .grid{stroke:#ddd}.axis{fill:none;stroke:#444}.line,.dashes{fill:none;stroke-width:1.6}.dashes{stroke-dasharray:6 3}\
 .band{fill-opacity:.2;stroke:none}.limit{stroke-dasharray:7 4;stroke-width:1.5}.bar{stroke:#222;stroke-width:.4}\
 .pv .line,.pv .dashes,.pv .limit{stroke:#0072b2}.pv .dot,.pv .band,.pv .name{fill:#0072b2}\

@@ -162,12 +162,3 @@ fn source_words(name: &str) -> &str {
         other => other,
     }
 }
-
-/// Returns the HTML table with empty fields in which the responsible people sign.
-pub(super) fn signatures() -> String {
-    let row = |role: &str| format!("<tr><th>{role}</th><td></td><td></td><td></td></tr>\n");
-    let rows: String = ["Recipe approved by", "Made by", "Checked by", "Released by"].map(row).concat();
-    format!(
-        "<h2>Signatures</h2>\n<table id=\"signatures\">\n<tr><th></th><th>name</th><th>date</th><th>signature</th></tr>\n{rows}</table>\n"
-    )
-}

@@ -61,11 +61,11 @@ fn estimated_figures(cycles: &[(u32, Value)], last: &Value) -> String {
         return String::new();
     }
     let mut html = format!(
-        "<table id=\"told\">\n<tr><th>figure</th>{}<th class=\"n\">raw, last cycle</th><th>unit</th><th>what it is</th></tr>\n",
+        "<table id=\"told\">\n<thead><tr><th>figure</th>{}<th class=\"n\">raw, last cycle</th><th>unit</th><th>what it is</th></tr></thead>\n",
         heads(cycles)
     );
     for row in list {
-        let text = |key: &str| escaped(row[key].as_str().unwrap_or_default());
+        let text = |key: &str| escaped(&with_micro(row[key].as_str().unwrap_or_default()));
         let cell = |(_, figures): &(u32, Value)| match named(figures, "form", &row["name"]).and_then(interval) {
             Some([median, low, high]) => format!("<td class=\"n\">{median}<br/><small>{low} to {high}</small></td>"),
             None => "<td class=\"n\">-</td>".to_owned(),
@@ -75,8 +75,8 @@ fn estimated_figures(cycles: &[(u32, Value)], last: &Value) -> String {
             html,
             "<tr><td>{}</td>{cells}<td class=\"n\">{}</td><td>{}</td><td>{}</td></tr>",
             text("name"),
-            row["raw"].as_f64().map_or("-".to_owned(), three_digits),
-            text("unit"),
+            in_unit(row, "raw").unwrap_or_else(|| "-".to_owned()),
+            unit(row),
             text("made")
         );
     }
@@ -90,37 +90,65 @@ fn estimated_figures(cycles: &[(u32, Value)], last: &Value) -> String {
 /// Returns three texts from a row of `figures.json`: the median of a figure, and the lower and upper end of its
 /// credible interval. Returns `None` if one of the three is missing.
 fn interval(row: &Value) -> Option<[String; 3]> {
-    let number = |key: &str| row[key].as_f64().map(three_digits);
-    Some([number("median")?, number("low")?, number("high")?])
+    Some([in_unit(row, "median")?, in_unit(row, "low")?, in_unit(row, "high")?])
+}
+
+/// Returns a number of a row in the unit that [`unit`] names. Lengths are in micrometres throughout the report.
+fn in_unit(row: &Value, key: &str) -> Option<String> {
+    let scale = if row["unit"] == "nm" { 1e-3 } else { 1.0 };
+    row[key].as_f64().map(|value| three_digits(scale * value))
+}
+
+/// Returns the unit of a row.
+fn unit(row: &Value) -> String {
+    match row["unit"].as_str().unwrap_or_default() {
+        "nm" | "um" => "\u{b5}m".to_owned(),
+        "urad" => "\u{b5}rad".to_owned(),
+        other => escaped(other),
+    }
+}
+
+/// Returns a text of `figures.json` with the signs of its units, which the file has in ASCII.
+fn with_micro(text: &str) -> String {
+    text.replace(" um", " \u{b5}m").replace(" urad", " \u{b5}rad")
 }
 
 /// Returns the HTML table of the figures that were computed directly from the measured points and from the map. These
 /// figures include the noise of the probe. `cycles` contains the number and the figures of each cycle. `last` contains
 /// the figures of the last cycle, which determine the rows of the table.
 fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
+    let rows = listed(last, "figures");
     let title = if listed(last, "form").is_empty() { "" } else { "<h3>Raw, as measured</h3>\n" };
     let mut html = format!(
-        "{title}<table id=\"form\">\n<tr><th>figure</th>{}<th>unit</th><th>what it is</th><th>removed</th><th>wavelengths left out</th></tr>\n",
+        "{title}<table id=\"form\">\n<thead><tr><th>figure</th>{}<th>unit</th><th>what it is</th></tr></thead>\n",
         heads(cycles)
     );
-    for row in listed(last, "figures") {
-        let text = |key: &str| escaped(row[key].as_str().unwrap_or_default());
+    // The most figures have the same removed and the same wavelengths left out. Only others state theirs.
+    let usual = ["removed", "cut_off"].map(|key| rows.first().and_then(|row| row[key].as_str()).unwrap_or_default());
+    for row in rows {
+        let text = |key: &str| with_micro(row[key].as_str().unwrap_or_default());
         let cell = |(_, figures): &(u32, Value)| {
-            let value = named(figures, "figures", &row["name"]).and_then(|row| row["value"].as_f64());
-            format!("<td class=\"n\">{}</td>", value.map_or("-".to_owned(), three_digits))
+            let value = named(figures, "figures", &row["name"]).and_then(|row| in_unit(row, "value"));
+            format!("<td class=\"n\">{}</td>", value.unwrap_or_else(|| "-".to_owned()))
         };
         let cells: String = cycles.iter().map(cell).collect();
+        let mut made = text("made");
+        for ((key, word), usual) in [("removed", "removed"), ("cut_off", "left out")].into_iter().zip(usual) {
+            let of_row = text(key);
+            if of_row != with_micro(usual) {
+                let _ = write!(made, "; {word}: {of_row}");
+            }
+        }
         let _ = writeln!(
             html,
-            "<tr><td>{}</td>{cells}<td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>",
-            text("name"),
-            text("unit"),
-            text("made"),
-            text("removed"),
-            text("cut_off")
+            "<tr><td>{}</td>{cells}<td>{}</td><td>{}</td></tr>",
+            escaped(&text("name")),
+            unit(row),
+            escaped(&made)
         );
     }
-    html + "</table>\n"
+    let [removed, cut_off] = usual.map(|text| escaped(&with_micro(text)));
+    html + &format!("</table>\n<p>Unless stated: removed {removed}; wavelengths left out: {cut_off}.</p>\n")
 }
 
 /// Returns an HTML list with the tolerance indications of ISO 10110-5 (texts such as "3/A(B/C)") for each cycle. Each
@@ -135,10 +163,14 @@ fn notations(cycles: &[(u32, Value)]) -> String {
     for (number, figures) in cycles {
         let notation = figures["iso_10110_5"]["notation"].as_str().unwrap_or("-");
         let of_form = figures["form_iso_10110_5"].as_str();
-        let of_form = of_form.map_or(String::new(), |of| format!("<code>{}</code>; raw ", escaped(of)));
+        let of_form = of_form.map_or(String::new(), |of| format!("<code class=\"whole\">{}</code>; raw ", escaped(of)));
         let missing = figures["missing"].as_array().into_iter().flatten().filter_map(Value::as_str);
         let missing: String = missing.map(|why| format!("; no {}", escaped(why))).collect();
-        let _ = writeln!(html, "<li>cycle {number}: {of_form}<code>{}</code>{missing}</li>", escaped(notation));
+        let _ = writeln!(
+            html,
+            "<li>cycle {number}: {of_form}<code class=\"whole\">{}</code>{missing}</li>",
+            escaped(notation)
+        );
     }
     html + "</ul>\n"
 }

@@ -17,6 +17,12 @@ use super::simulation_mark::mark_simulation;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
 use super::{ReportError, range};
 
+/// Returns the samples with the lowest and the highest value. There must be a sample.
+fn extremes(samples: &[[f64; 3]]) -> [[f64; 3]; 2] {
+    let by_value = |a: &&[f64; 3], b: &&[f64; 3]| a[2].total_cmp(&b[2]);
+    [samples.iter().min_by(by_value), samples.iter().max_by(by_value)].map(|found| found.copied().unwrap_or_default())
+}
+
 /// Heat map of scattered samples, with its peak to valley and root mean square.
 #[derive(Clone, Debug)]
 pub struct HeatMap {
@@ -36,6 +42,8 @@ pub struct HeatMap {
     figures_of: [&'static str; 2],
     /// Maximum size of the map on the page, in pixels of the page.
     max_size: [f64; 2],
+    /// Samples with the lowest and the highest value: x, y, value.
+    extremes: [[f64; 3]; 2],
 }
 
 impl HeatMap {
@@ -63,6 +71,7 @@ impl HeatMap {
             lines: Vec::new(),
             figures_of: ["", "points"],
             max_size: [WIDTH, HEIGHT],
+            extremes: extremes(samples),
         };
         Ok(map.with_colours(ColourMap::Diverging))
     }
@@ -254,7 +263,28 @@ impl HeatMap {
         let rendering = if pixel > 4.0 { "pixelated" } else { "auto" };
         svg.image(frame.corner, frame.size, &STANDARD.encode(self.to_png()?), rendering);
         svg.frame(&frame);
-        self.colour_bar(&mut svg, [left + width + 18.0, top], height);
+        self.colour_bar(&mut svg, [left + width + 18.0, top], height, true);
+        Ok(svg.finish())
+    }
+
+    /// Returns the map for a page that has its title and its figures around it: the map within axes, a colour bar, and
+    /// its lowest and highest sample, each with a cross and its value.
+    ///
+    /// # Errors
+    /// Fails if the pixels cannot be encoded.
+    pub fn to_plain_svg(&self) -> Result<String, ReportError> {
+        let frame = Frame { corner: [44.0, 8.0], x_label: "mm", y_label: "", ..self.frame_at([44.0, 8.0]) };
+        let ([left, top], [width, height], rulers) = (frame.corner, frame.size, self.rulers(frame.corner));
+        let mut svg = Svg::new(left + width + 74.0, top + height + 44.0);
+        svg.image(frame.corner, frame.size, &STANDARD.encode(self.to_png()?), "auto");
+        svg.frame(&frame);
+        self.colour_bar(&mut svg, [left + width + 12.0, top], height, false);
+        svg.text([left + width + 12.0, top + height + 19.0], Anchor::Start, SMALL, &self.unit);
+        for [x, y, value] in self.extremes {
+            let at = [rulers[0].pixel(x), rulers[1].pixel(y)];
+            let sign = if value < 0.0 { "\u{2212}" } else { "+" };
+            svg.cross(at, &format!("{sign}{}", three_digits(value.abs())), at[0] > left + 0.8 * width);
+        }
         Ok(svg.finish())
     }
 
@@ -279,17 +309,26 @@ impl HeatMap {
     }
 
     fn frame(&self, lines: usize) -> Frame<'static> {
+        self.frame_at([66.0, 40.0 + LINE * lines as f64])
+    }
+
+    /// Returns the rulers of both axes of a map whose upper left corner is at `corner`.
+    fn rulers(&self, corner: [f64; 2]) -> [Ruler; 2] {
         let Grid { first_mm, spacing_mm: pixel_mm, .. } = self.raster.grid;
         let (extent, size) = (self.extent_mm(), self.size());
-        let corner = [66.0, 40.0 + LINE * lines as f64];
         let low: [f64; 2] = std::array::from_fn(|k| first_mm[k] - 0.5 * pixel_mm[k]);
         let x = Ruler::new(Scale::Linear, [low[0], low[0] + extent[0]], [corner[0], corner[0] + size[0]]);
-        let y = Ruler::new(Scale::Linear, [low[1], low[1] + extent[1]], [corner[1] + size[1], corner[1]]);
-        let (x_ticks, y_ticks) = (x.ticks((size[0] / 60.0) as usize), y.ticks((size[1] / 40.0) as usize));
+        [x, Ruler::new(Scale::Linear, [low[1], low[1] + extent[1]], [corner[1] + size[1], corner[1]])]
+    }
+
+    fn frame_at(&self, corner: [f64; 2]) -> Frame<'static> {
+        let size = self.size();
+        let [x, y] = self.rulers(corner);
+        let (x_ticks, y_ticks) = (x.ticks((size[0] / 60.0) as usize), y.ticks((size[1] / 30.0) as usize));
         Frame { corner, size, x_ticks, y_ticks, x_label: "x / mm", y_label: "y / mm", grid: false }
     }
 
-    fn colour_bar(&self, svg: &mut Svg, [left, top]: [f64; 2], height: f64) {
+    fn colour_bar(&self, svg: &mut Svg, [left, top]: [f64; 2], height: f64, has_name: bool) {
         const BAR: f64 = 16.0;
         svg.gradient(&self.tones.id(), &self.tones.stops());
         svg.rectangle([left, top], [BAR, height], &format!("url(#{})", self.tones.id()));
@@ -302,8 +341,10 @@ impl HeatMap {
             svg.line([left + BAR, tick.pixel], [left + BAR + 4.0, tick.pixel], super::svg::INK);
             svg.tick_label([left + BAR + 8.0, tick.pixel + 4.0], Anchor::Start, &tick);
         }
-        let name = format!("{} / {}", self.quantity, self.unit);
-        svg.upright([left + 76.0, top + height / 2.0], &name);
+        if has_name {
+            let name = format!("{} / {}", self.quantity, self.unit);
+            svg.upright([left + 76.0, top + height / 2.0], &name);
+        }
     }
 
     fn summary(&self) -> String {

@@ -1,56 +1,161 @@
-//! Maps in the report of a run: the first and the last cycle on one scale, and the last cycle on its own scale.
+//! Error maps of a run as its report shows them: on the scale of the tolerance and on their own, with the sections
+//! through their extremes and the distribution of their values.
 
-use std::fmt::Write;
 use std::path::Path;
 
-use super::convergence::histogram;
+use super::axis::{Scale, fixed, grouped};
+use super::chart::{Chart, ChartAxis, Layer, Mark};
+use super::colour::ColourMap;
 use super::heat_map::HeatMap;
-use super::run::when;
 use super::run_history::RunHistory;
+use super::texts::ReportText as Text;
 use super::{ReportError, range};
 use regrind_formats::{MapNode, escaped, read_error_map};
+use regrind_language::{Language, decimal};
 
-/// Maximum size of a map of a pair, and of a single map, in pixels of the page.
-const OF_A_PAIR: [f64; 2] = [262.0, 262.0];
-const ALONE: [f64; 2] = [600.0, 460.0];
+/// Maximum size of a map in pixels of the page.
+const MAP: [f64; 2] = [250.0, 190.0];
+/// Width and height of a chart in pixels of the page.
+const CHART: [f64; 2] = [400.0, 180.0];
+/// Number of bars of a distribution.
+const BARS: usize = 41;
 
-/// Width of the axes and the colour bar next to a map of that size, in pixels of the page.
-const BESIDE: f64 = 172.0;
-
-/// Map of a cycle with its heading.
-struct CycleMap {
-    cycle: u32,
-    title: String,
-    part: String,
+/// Filtered error map of a cycle.
+pub(super) struct CycleMap {
+    pub(super) cycle: u32,
+    /// x and y in millimetres and the error in micrometres of each node.
     samples_um: Vec<[f64; 3]>,
 }
 
+/// Reads the maps of the first and of the last cycle that has one; only the last one if there is no other.
+///
+/// # Errors
+/// Fails if the file of an error map cannot be read.
+pub(super) fn read_maps(story: &RunHistory, folder: &Path) -> Result<Vec<CycleMap>, ReportError> {
+    let mapped: Vec<(u32, &str)> =
+        story.cycles.iter().filter_map(|(cycle, told)| Some((*cycle, told.map.as_ref()?.0.as_str()))).collect();
+    let last = mapped.last().copied();
+    let first = mapped.first().copied().filter(|_| mapped.len() > 1);
+    let read = |(cycle, name): (u32, &str)| -> Result<CycleMap, ReportError> {
+        let nodes = read_error_map(&folder.join(name))?;
+        let samples_um = nodes.iter().map(MapNode::error).map(|[x, y, error_mm]| [x, y, 1e3 * error_mm]).collect();
+        Ok(CycleMap { cycle, samples_um })
+    };
+    first.into_iter().chain(last).map(read).collect()
+}
+
+/// Returns the smallest round number that is at least `limit`: 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6 or 8 times a power of
+/// ten. Neighbouring maps then often have the same scale. The page of a cell rounds in the same way.
+fn round_limit(limit: f64) -> f64 {
+    if !(limit > 0.0 && limit.is_finite()) {
+        return 1.0;
+    }
+    let decade = 10f64.powf(limit.log10().floor());
+    let steps = [1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0];
+    steps.map(|step| step * decade).into_iter().find(|round| *round >= 0.999 * limit).unwrap_or(limit)
+}
+
 impl CycleMap {
-    fn max_magnitude_um(&self) -> f64 {
+    /// Returns the limit of the map's own scale, in micrometres.
+    pub(super) fn own_limit_um(&self) -> f64 {
         let [low, high] = range(self.samples_um.iter().map(|s| s[2]));
-        low.abs().max(high.abs())
+        round_limit(low.abs().max(high.abs()))
     }
 
-    /// Returns an HTML figure with the coloured map of this cycle and a caption below the map. The colour scale runs
-    /// from `-limit_um` to `limit_um`, in micrometres. `largest` is the maximum width and height of the map in pixels.
-    /// The caption is the number of the cycle, followed by `caption`. If the map cannot be drawn, for example because
-    /// it has fewer than two nodes, the figure contains the reason instead of the map.
+    /// Returns the map as SVG, with the colours from `-limit_um` to `limit_um`. A map that cannot be drawn, for example
+    /// because it has one node only, is a paragraph with the reason.
     ///
     /// # Errors
-    /// Fails only if the drawing returns [`ReportError::File`]. For every other error of the drawing, the function
-    /// returns the figure with the reason.
-    fn figure(&self, limit_um: f64, largest: [f64; 2], caption: &str) -> Result<String, ReportError> {
-        let width = largest[0] + BESIDE;
-        let svg = HeatMap::new(&shortened(&self.title, width, 8.5), "deviation", "\u{b5}m", &self.samples_um)
-            .and_then(|map| map.of_nodes().with_max_size(largest).with_limit(limit_um))
-            .and_then(|map| map.with_lines(vec![shortened(&self.part, width, 6.8)]).to_svg());
-        let drawn = match svg {
-            Ok(svg) => within_html(&svg),
-            Err(ReportError::File(error)) => return Err(error.into()),
-            Err(reason) => format!("<p>No map: {}</p>\n", escaped(&reason.to_string())),
-        };
-        Ok(format!("<figure>{drawn}<figcaption>Cycle {}, {caption}</figcaption></figure>\n", self.cycle))
+    /// Fails only if the drawing returns [`ReportError::File`].
+    pub(super) fn picture(&self, limit_um: f64) -> Result<String, ReportError> {
+        let drawn = HeatMap::new("", "", "\u{b5}m", &self.samples_um)
+            .and_then(|map| map.with_max_size(MAP).with_limit(limit_um)?.to_plain_svg());
+        match drawn {
+            Ok(svg) => Ok(within_html(&svg)),
+            Err(ReportError::File(error)) => Err(error.into()),
+            Err(reason) => Ok(format!("<p>{}</p>\n", escaped(&reason.to_string()))),
+        }
     }
+
+    /// Returns two charts of the error: along x and along y, each through the lowest and the highest node.
+    pub(super) fn sections(&self, language: Language) -> [String; 2] {
+        let by_value = |a: &&[f64; 3], b: &&[f64; 3]| a[2].total_cmp(&b[2]);
+        let samples = &self.samples_um;
+        let extremes = [samples.iter().max_by(by_value), samples.iter().min_by(by_value)];
+        let limit = self.own_limit_um();
+        let number = |value: f64, decimals: usize| decimal(value, decimals, language);
+        [0, 1].map(|along| {
+            let across = 1 - along;
+            let line = |extreme: &[f64; 3]| {
+                // Nodes of one row are written with identical coordinates.
+                let on_line = samples.iter().filter(|s| (s[across] - extreme[across]).abs() < 1e-6);
+                let mut points: Vec<[f64; 2]> = on_line.map(|s| [s[along], s[2]]).collect();
+                points.sort_by(|a, b| a[0].total_cmp(&b[0]));
+                points
+            };
+            let title = [Text::SectionAlongX, Text::SectionAlongY][along].to(language);
+            let layers: Vec<Layer> = extremes
+                .iter()
+                .flatten()
+                .zip(["s1", "s0"])
+                .map(|(extreme, class)| Layer {
+                    name: format!("{} mm: {}", number(extreme[across], 2), signed(extreme[2], language)),
+                    class: class.to_owned(),
+                    marks: vec![Mark::Line(line(extreme))],
+                })
+                .collect();
+            let ends = range(samples.iter().map(|s| s[along]));
+            let chart = Chart {
+                title: title.to_owned(),
+                size: CHART,
+                right_margin: 190.0,
+                x: ChartAxis::new("mm", Scale::Linear, ends, 6, &number),
+                y: ChartAxis::new("\u{b5}m", Scale::Linear, [-limit, limit], 6, &number),
+                layers,
+                has_legend: true,
+                ..Chart::default()
+            };
+            chart.to_markup()
+        })
+    }
+
+    /// Returns the distribution of the error over the nodes. Each bar has the colour that the map gives its error.
+    pub(super) fn distribution(&self, language: Language) -> String {
+        let limit = self.own_limit_um();
+        let mut counts = [0_usize; BARS];
+        for [.., error] in &self.samples_um {
+            let share = (error / limit + 1.0) / 2.0;
+            counts[((share * BARS as f64) as usize).min(BARS - 1)] += 1;
+        }
+        let most = counts.iter().copied().max().unwrap_or(0).max(1) as f64;
+        let edge = |k: usize| limit * (2.0 * k as f64 / BARS as f64 - 1.0);
+        let bar = |(k, count): (usize, &usize)| Mark::Bar {
+            class: "",
+            fill: Some(ColourMap::Diverging.at((k as f64 + 0.5) / BARS as f64)),
+            x: [edge(k), edge(k + 1)],
+            y: [0.0, *count as f64],
+            tooltip: String::new(),
+        };
+        let marks = counts.iter().enumerate().map(bar).collect();
+        let number = |value: f64, decimals: usize| decimal(value, decimals, language);
+        let nodes = Text::Nodes.to(language);
+        let chart = Chart {
+            title: format!("{}: {} {nodes}", Text::Distribution.to(language), grouped(self.samples_um.len())),
+            size: CHART,
+            right_margin: 30.0,
+            x: ChartAxis::new(Text::ErrorAxis.to(language), Scale::Linear, [-limit, limit], 8, &number),
+            y: ChartAxis::new(nodes, Scale::Linear, [0.0, most], 4, &fixed),
+            layers: vec![Layer { marks, ..Layer::default() }],
+            ..Chart::default()
+        };
+        chart.to_markup()
+    }
+}
+
+/// Formats an error in micrometres with its sign.
+fn signed(um: f64, language: Language) -> String {
+    let sign = if um < 0.0 { "" } else { "+" };
+    format!("{sign}{} \u{b5}m", decimal(um, 2, language))
 }
 
 /// Removes the XML namespace from an SVG, because an SVG within an HTML page does not need it.
@@ -58,52 +163,54 @@ pub(super) fn within_html(svg: &str) -> String {
     svg.replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1)
 }
 
-/// Cuts a text that is wider than `width`, and ends it with "…". `letter` is the average width of a letter; both are in
-/// pixels.
-fn shortened(text: &str, width: f64, letter: f64) -> String {
-    let most = (width / letter) as usize;
-    if text.chars().count() <= most {
-        return text.to_owned();
-    }
-    text.chars().take(most.saturating_sub(1)).chain(['\u{2026}']).collect()
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
 
-/// Returns the HTML section of the filtered error maps. It contains the maps of the first and the last cycle on one
-/// colour scale, the map of the last cycle on its own scale, and the histogram of that map. If only one cycle has a
-/// map, the pair on one scale is omitted. `folder` is the run folder. Returns an empty text if no cycle has an error map.
-///
-/// # Errors
-/// Fails if the file of an error map cannot be read, or if the histogram cannot be drawn.
-pub(super) fn maps(story: &RunHistory, folder: &Path) -> Result<String, ReportError> {
-    let mapped = || story.cycles.iter().filter_map(|(cycle, told)| Some((*cycle, told.map.as_ref()?)));
-    let Some(last) = mapped().next_back() else { return Ok(String::new()) };
-    let first = mapped().next().filter(|(cycle, _)| *cycle != last.0);
-    let [part, ..] = story.start.content.names();
-    let part = part.unwrap_or("Part");
-    let serial = story.begin.as_ref().map_or("", |begin| begin.part.as_str());
-    let mark = if story.start.simulation == Some(true) { " (SIMULATION)" } else { "" };
-    let read = |(cycle, (name, utc)): (u32, &(String, String))| -> Result<CycleMap, ReportError> {
-        let nodes = read_error_map(&folder.join(name))?;
-        let samples_um = nodes.iter().map(MapNode::error).map(|[x, y, error_mm]| [x, y, 1e3 * error_mm]).collect();
-        let title = format!("Cycle {cycle}, {}{mark}", when(utc));
-        Ok(CycleMap { cycle, title, part: format!("{part}, {serial}"), samples_um })
-    };
-    let (first, last) = (first.map(read).transpose()?, read(last)?);
-    let mut html = "<h2>Error of the part, filtered</h2>\n".to_owned();
-    if let Some(first) = first {
-        let common = first.max_magnitude_um().max(last.max_magnitude_um());
-        for drawn in [&first, &last] {
-            html += &drawn.figure(common, OF_A_PAIR, "on one scale")?;
-        }
+    fn map() -> CycleMap {
+        let node = |k: usize| {
+            let [x, y] = [(k % 5) as f64, (k / 5) as f64];
+            [x, y, if k == 7 { 4.2 } else { 0.1 * x - y }]
+        };
+        CycleMap { cycle: 2, samples_um: (0..20).map(node).collect() }
     }
-    html += &last.figure(last.max_magnitude_um(), ALONE, "on its own scale")?;
-    let heading = format!("Cycle {}, {}", last.cycle, last.part);
-    let spread = histogram(&shortened(&heading, 460.0, 8.5), &last.samples_um);
-    let _ = writeln!(html, "<figure>{}</figure>", within_html(&spread));
-    let _ = writeln!(
-        html,
-        "<p>Red is above the nominal surface, blue is below it, near white is zero. The maps are filtered; PV and RMS of a map \
-         are not the judged figures.</p>"
-    );
-    Ok(html)
+
+    #[test]
+    fn limits_are_round() {
+        assert_eq!([0.0, 4.2, 0.11, 20.0, 8.1, f64::NAN].map(round_limit), [1.0, 5.0, 0.12, 20.0, 10.0, 1.0]);
+        assert_eq!(map().own_limit_um(), 5.0);
+    }
+
+    /// The highest node is the eighth, at x = 2 and y = 1; the lowest is at x = 0 and y = 3.
+    #[test]
+    fn sections_go_through_extremes() {
+        let [along_x, along_y] = map().sections(Language::De);
+        for svg in [&along_x, &along_y] {
+            roxmltree::Document::parse(svg).unwrap();
+            assert_eq!(svg.matches("<polyline").count(), 2, "{svg}");
+        }
+        assert!(
+            along_x.contains("1,00 mm: +4,20 \u{b5}m") && along_x.contains("3,00 mm: \u{2212}3,00 \u{b5}m"),
+            "{along_x}"
+        );
+        assert!(along_y.contains("2,00 mm: +4,20") && along_y.contains("0,00 mm: \u{2212}3,00"), "{along_y}");
+    }
+
+    #[test]
+    fn distribution_counts_every_node_once() {
+        let svg = map().distribution(Language::En);
+        roxmltree::Document::parse(&svg).unwrap();
+        assert!(svg.contains("20 nodes") && !svg.contains("NaN"), "{svg}");
+        assert_eq!(svg.matches("<rect").count(), BARS, "bars");
+        let flat = CycleMap { cycle: 1, samples_um: vec![[0.0, 0.0, 0.0]; 3] };
+        assert!(!flat.distribution(Language::En).contains("NaN"));
+        assert!(flat.picture(1.0).unwrap().starts_with("<p>"), "one place is no map");
+    }
+
+    #[test]
+    fn picture_marks_extremes() {
+        let svg = map().picture(5.0).unwrap();
+        roxmltree::Document::parse(&svg).unwrap();
+        assert!(svg.contains("+4.20") && svg.contains("\u{2212}3.00") && svg.contains("\u{b5}m"), "{svg}");
+    }
 }

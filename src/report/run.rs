@@ -1,5 +1,10 @@
 //! Report of a run: one HTML file that opens without a network, made from the journal and the files on record.
 //!
+//! ```text
+//!  page 1, which can be filed alone   verdict, judged figures, maps, cycles, machines, record, signatures
+//!  the pages after it                 sections, uncertainty, form, cycles, machines, alarms, orders, definitions
+//! ```
+//!
 //! It is made only from a record that passes verification. It ends with the hash of the last record, so that a reader
 //! of the report can check if a journal is the one that the report was made from.
 
@@ -7,258 +12,151 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use super::ReportError;
+use super::chart::PAPER;
 use super::convergence::convergence;
-use super::equipment::{equipment, last_model, last_registration, registered, signatures};
+use super::equipment::{equipment, last_model, last_registration, registered};
+use super::first_page::first_page;
 use super::form::form;
-use super::maps::{maps, within_html};
-use super::run_history::{Measurement, PassHistory, RunHistory};
-use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
-use regrind_cell::{ComparedFigure, Conformity, Ending, Figures, JobResult, RecordedParameter, Tolerance};
+use super::maps::read_maps;
+use super::report_content::{Report, when};
+use super::run_history::{AlarmHistory, Measurement, Order, RunHistory};
+use super::texts::{self, ReportText as Text};
+use super::words::{judgement_words, role_words, verdict_words};
+use regrind_cell::{Figures, PvPoints, RecordedParameter, Tolerance};
 use regrind_formats::run_files::RunFile;
 use regrind_formats::{escaped, write_atomic};
-use regrind_journal::Verified;
+use regrind_language::Language;
 use regrind_record::TouchCounts;
 
-const STYLE: &str = "body{font:15px/1.45 Helvetica,Arial,sans-serif;color:#222;max-width:62em;margin:2em auto;padding:0 1em}\
-h1{font-size:1.6em;margin:0}h2{font-size:1.15em;margin:2em 0 .5em}table{border-collapse:collapse}\
-td,th{padding:.25em .8em;text-align:left;border-bottom:1px solid #ddd;vertical-align:top}td.n,th.n{text-align:right;\
-white-space:nowrap;font-variant-numeric:tabular-nums}td.t{white-space:nowrap}\
-.mark{background:#222;color:#fff;padding:.4em .8em;font-weight:bold;letter-spacing:.15em}\
-.good,.bad{padding:.6em .8em;font-weight:bold}.good{background:#d5ead0}.bad{background:#f7d9d0}\
-#judged td{font-size:1.1em}tr.of td{border-bottom:none;padding-top:.6em}figure{display:inline-block;margin:0 .5em 1em 0;max-width:100%}figure svg{max-width:100%;height:auto}\
-figcaption{color:#555}code{font-size:.85em;word-break:break-all}\
-footer{margin-top:2.5em;border-top:1px solid #ddd;color:#555}\
-#signatures td{min-width:11em;height:2.6em;border-bottom:1px solid #222}\
-@page{size:auto;margin:14mm}@media print{body{font-size:10.5pt;max-width:none;margin:0;padding:0}\
-h2{break-after:avoid}figure,tr,#signatures,footer{break-inside:avoid}.good,.bad,.mark{print-color-adjust:exact}\
-td,th{padding:.2em .5em}}";
+const STYLE: &str = include_str!("report.css");
 
-/// Verifies the record in the run folder `folder`, writes the HTML report of the run (`report.html`) into this folder,
-/// and returns its path.
+/// Verifies the record in the run folder `folder`, writes the HTML report of the run (`report.html`) in `language` into
+/// this folder, and returns its path.
 ///
 /// # Errors
 /// Fails if the record is missing or does not pass verification, if a file on record cannot be read, or if the report
 /// cannot be written.
-pub fn write_run_report(folder: &Path) -> Result<PathBuf, ReportError> {
+pub fn write_run_report(folder: &Path, language: Language) -> Result<PathBuf, ReportError> {
     let path = folder.join(RunFile::Report.name());
-    write_atomic(&path, run_report(folder)?.as_bytes())?;
+    write_atomic(&path, run_report(folder, language)?.as_bytes())?;
     Ok(path)
 }
 
-/// Verifies the record in the run folder `folder` and returns the report of the run as HTML.
+/// Verifies the record in the run folder `folder` and returns the report of the run in `language` as HTML.
 ///
 /// # Errors
 /// Fails if the record is missing or does not pass verification, or if a file on record cannot be read.
-pub fn run_report(folder: &Path) -> Result<String, ReportError> {
+pub fn run_report(folder: &Path, language: Language) -> Result<String, ReportError> {
     let (story, verified) = RunHistory::read_verified(folder)?;
-    html(&story, folder, &verified)
+    html(&Report { story: &story, verified: &verified, maps: read_maps(&story, folder)?, language }, folder)
 }
 
-fn html(story: &RunHistory, folder: &Path, verified: &Verified) -> Result<String, ReportError> {
+/// Returns the language of a report, from the text of its file. Returns `None` if it states none of the languages.
+pub fn report_language(html: &str) -> Option<Language> {
+    let tag = html.split("<html lang=\"").nth(1)?.split('"').next()?;
+    Language::first_of(tag)
+}
+
+fn html(report: &Report, folder: &Path) -> Result<String, ReportError> {
+    let Report { story, verified, language, .. } = report;
     let [name, ..] = story.start.content.names();
-    let (name, run) = (escaped(name.unwrap_or("Part")), escaped(story.start.run.as_deref().unwrap_or_default()));
-    let serial = story.begin.as_ref().map_or(String::new(), |begin| format!(", {}", escaped(&begin.part)));
-    let mark = if story.start.simulation == Some(true) { "<p class=\"mark\">SIMULATION</p>\n" } else { "" };
+    let title = format!("{}, {}", name.unwrap_or("Part"), report.run());
     let mut html = format!(
-        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n<title>{name}, {run}</title>\n\
-         <style>{STYLE}</style>\n</head>\n<body>\n{mark}<h1>{name}{serial}</h1>\n"
+        "<!DOCTYPE html>\n<html lang=\"{}\">\n<head>\n<meta charset=\"utf-8\"/>\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n<title>{}</title>\n\
+         <style>{STYLE}{PAPER}{}</style>\n</head>\n<body>\n",
+        language.tag(),
+        escaped(&title),
+        running_foot(report),
     );
-    html += &verdict(story);
-    html += &broken_off_pass(story);
-    html += &judged(story);
     let registration = last_registration(story, folder)?;
-    html += &facts(story);
-    html += &equipment(story, registration.as_ref().map(|(_, found)| found));
-    html += &cycles(story);
-    if let Some(plot) = convergence(story) {
-        let _ = writeln!(html, "<figure>{}</figure>", within_html(&plot));
-    }
-    html += &maps(story, folder)?;
+    html += &first_page(report, registration.as_ref().map(|(_, found)| found))?;
+    html += "<section class=\"details\">\n";
+    html += &charts(report);
     html += &registration
         .map_or(String::new(), |(cycle, found)| registered(cycle, &found, last_model(story, folder).as_ref()));
     html += &form(story, folder)?;
-    html += &alarms(story);
-    html += &orders(story);
-    html += &signatures();
-    let Verified { records, head, closed, signed, .. } = verified;
-    let end = if *closed { "closed" } else { "not closed yet" };
+    html += &cycles(report);
+    html += &equipment(story, last_registration(story, folder)?.as_ref().map(|(_, found)| found));
+    html += &alarms(report);
+    html += &orders(report);
+    html += &definitions(report);
+    let (records, head, signed) = (verified.records, &verified.head, verified.signed);
     let by = verified.keys.iter().map(|key| format!("<br/><code>{key}</code>")).collect::<String>();
-    let by = if by.is_empty() { "Not signed.".into() } else { format!("Signed up to record {signed} with:{by}") };
+    let end = report.say(if verified.closed { Text::Closed } else { Text::NotClosed });
+    let by = if by.is_empty() {
+        report.say(Text::NotSigned).to_owned()
+    } else {
+        format!("{} {signed}:{by}", report.say(Text::Signed))
+    };
     let _ = write!(
         html,
-        "<footer><p>Made from {records} records in an unbroken chain ({end}). Hash of the last record:<br/><code>{head}</code><br/>{by}<br/>\
-         To verify the record again: <code>regrind audit verify</code></p></footer>\n</body>\n</html>\n"
+        "</section>\n<footer><p>{records} {}, {}, {end}. {}:<br/><code>{head}</code><br/>{by}<br/>{}: <code>regrind audit verify</code></p></footer>\n</body>\n</html>\n",
+        report.say(Text::Records),
+        report.say(Text::Unbroken),
+        report.say(Text::HashOfLast),
+        report.say(Text::VerifyHint),
     );
     Ok(html)
 }
 
-fn verdict(story: &RunHistory) -> String {
-    let (class, words) = match (&story.ending, story.home) {
-        (Some(ending @ Ending::Accepted { .. }), _) => ("good", ending_words(ending)),
-        (Some(ending), _) => ("bad", ending_words(ending)),
-        (None, Some(home)) => (if home == [true, true] { "good" } else { "bad" }, home_words(home)),
-        (None, None) => ("bad", "The run has not ended.".to_owned()),
+/// Returns the style of the margins of printed pages: the serial number, the mark of a simulation, and the number of the
+/// page.
+fn running_foot(report: &Report) -> String {
+    // Within a string of a style sheet, each character can be written by its number.
+    let quoted = |text: &str| {
+        let number = |c: char| match c {
+            c if c.is_ascii_alphanumeric() || " -_.,:/".contains(c) => c.to_string(),
+            c => format!("\\{:06x}", u32::from(c)),
+        };
+        text.chars().map(number).collect::<String>()
     };
-    let unrecorded = story.ending.is_some() && story.end.is_none();
-    let more = if unrecorded { "<p>The record of the run is incomplete: its end is missing.</p>\n" } else { "" };
-    format!("<p class=\"{class}\">{}</p>\n{more}", escaped(&words))
-}
-
-/// Returns an HTML paragraph about an incomplete last pass: how the pass ended, and which percentage of its path was
-/// ground, if the grinder reported this. Returns an empty text if the last pass is complete, or if no pass was started.
-fn broken_off_pass(story: &RunHistory) -> String {
-    let Some(PassHistory { cycle, ground, result }) = story.pass else { return String::new() };
-    let how = match result {
-        Some(JobResult::Complete) => return String::new(),
-        Some(JobResult::Stopped) => "was stopped",
-        Some(JobResult::Aborted) => "was aborted",
-        Some(JobResult::Failed) => "failed",
-        None => "has no end on record",
-    };
-    let far = match ground {
-        Some([done, total]) if total > 0 => {
-            format!(
-                "{:.0} % of the path was ground, according to the last report of the grinder",
-                100.0 * f64::from(done) / f64::from(total)
-            )
-        }
-        _ => "the share of the path that was ground is not known".to_owned(),
-    };
-    format!("<p id=\"pass\">The pass of cycle {cycle} {how}: {far}; the rest of the part is unchanged.</p>\n")
-}
-
-/// Returns the HTML table of the judged figures of the last measurement, with their uncertainty, their limits and the
-/// decision rule. Returns an empty text if there is no tolerance or no measurement on record.
-fn judged(story: &RunHistory) -> String {
-    let (Some(tolerance), Some((cycle, of, figures))) = (story.tolerance(), story.last_measured()) else {
-        return String::new();
-    };
-    let judged = if of.judgements.is_empty() { "measured and not judged" } else { "judged" };
-    let mut html = format!(
-        "<table id=\"judged\">\n<tr><th>{judged}, cycle {cycle}</th><th class=\"n\">found, \u{b5}m</th>\
-         <th class=\"n\">U (k = 2), \u{b5}m</th><th class=\"n\">95 % credible interval, \u{b5}m</th><th class=\"n\">limit, \u{b5}m</th><th></th><th></th></tr>\n"
-    );
-    for compared in tolerance.compare(figures) {
-        let ComparedFigure { name, median_mm: found_mm, expanded_mm, interval_mm: [low_mm, high_mm], limit_mm, .. } =
-            compared;
-        let limit = if limit_mm.is_finite() { um(limit_mm) } else { "no limit".to_owned() };
-        let within = escaped(&compared.probability_in_words().unwrap_or_default());
-        let _ = writeln!(
-            html,
-            "<tr><td>{name}</td><td class=\"n\"><strong>{}</strong></td><td class=\"n\">\u{b1} {}</td>\
-             <td class=\"n\">{} to {}</td><td class=\"n\">{limit}</td><td>{within}</td><td>{}</td></tr>",
-            um(found_mm),
-            um(expanded_mm),
-            um(low_mm),
-            um(high_mm),
-            comparison(&compared, tolerance.with_uncertainty)
-        );
-    }
-    html + &format!("</table>\n<p>{}</p>\n", decision_rule(&tolerance))
-}
-
-fn um(mm: f64) -> String {
-    format!("{:.2}", 1e3 * mm)
-}
-
-/// Returns a text that says if a figure is within its limit, beyond it, or not decided. The text includes the compared
-/// values in micrometres, such as "within the limit: at most 3.10 ≤ 7.00". `with_uncertainty` is true if the decision
-/// rule uses the uncertainty of the figure. Returns an empty text if the figure has no limit.
-fn comparison(compared: &ComparedFigure, with_uncertainty: bool) -> String {
-    let ComparedFigure { median_mm: found_mm, compared_mm: [low_mm, high_mm], limit_mm, conformity, .. } = *compared;
-    if !limit_mm.is_finite() {
-        return String::new();
-    }
-    let words = match conformity {
-        Conformity::Within => "within the limit",
-        Conformity::Undecided => "not decided",
-        Conformity::Beyond => "beyond the limit",
-    };
-    let beside = |what: &str, value: f64| {
-        let is = if value <= limit_mm { "\u{2264}" } else { "&gt;" };
-        // Two different numbers must not be shown as the same number.
-        let alike = um(value) == um(limit_mm) && value != limit_mm;
-        let digits = if alike { 5 } else { 2 };
-        let [value, limit] = [value, limit_mm].map(|mm| format!("{:.digits$}", 1e3 * mm));
-        format!("{what}{value} {is} {limit}")
-    };
-    let sums = match (with_uncertainty, conformity) {
-        (false, _) => beside("", found_mm),
-        (true, Conformity::Within) => beside("at most ", high_mm),
-        (true, Conformity::Beyond) => beside("at least ", low_mm),
-        (true, Conformity::Undecided) => format!("{}, {}", beside("at most ", high_mm), beside("at least ", low_mm)),
-    };
-    format!("{words}: {sums}")
-}
-
-fn decision_rule(tolerance: &Tolerance) -> String {
-    let rule = if tolerance.with_uncertainty {
-        format!(
-            "Decision rule, after ISO 14253-1 and JCGM 106: the part is accepted only if each figure is within its limit with a \
-             probability of at least {:.1} %. The part is out of tolerance only if at least one figure is \
-             beyond its limit with at least this probability. In all other cases, the result is undecided.",
-            1e2 * tolerance.probability
-        )
-    } else {
-        "Decision rule: each figure is compared with its limit. The uncertainty of the figure is shown, but the comparison \
-         does not use this uncertainty."
-            .to_owned()
-    };
+    let mark = if report.story.start.simulation == Some(true) { " - SIMULATION" } else { "" };
+    let program = report.story.start.regrind.as_deref().unwrap_or_default();
     format!(
-        "{rule} The figures describe the form of the part after the best fit of the form, without the noise of the probe. The \
-         uncertainty of each figure includes the noise of the probe and the uncertainty of the pose. If no form error is detectable, only an \
-         upper bound of a figure is known. U is half of the 95 % credible interval of the figure. PV is the largest deviation minus the \
-         smallest deviation along the normal of the surface{}.",
-        match tolerance.pv_points {
-            regrind_cell::PvPoints::All => ", of the measured points",
-            regrind_cell::PvPoints::MostPoints =>
-                "; PV 99.8 % is the PV over the aperture (the measured points and the positions between the points). The lowest 0.1 % and the highest 0.1 % are left out, but never a measured point",
-        }
+        "@page{{@bottom-left{{content:\"Regrind {} - {}\"}}@bottom-right{{content:\"{}{mark} - {} \" counter(page) \" {} \" counter(pages)}}}}",
+        quoted(program),
+        quoted(report.run()),
+        quoted(report.serial()),
+        quoted(report.say(Text::Page)),
+        quoted(report.say(Text::CountOf)),
     )
 }
 
-fn facts(story: &RunHistory) -> String {
-    let Some(first) = &story.begin else { return String::new() };
-    let [_, recipe, cell] = story.start.content.names();
-    let part = story.start.content.part();
-    let hashes = part.map_or([None, None], |part| [part.recipe_sha256.as_deref(), part.cell_sha256.as_deref()]);
-    let source = |texts: [Option<&str>; 2]| {
-        let [path, sha256] = texts.map(|text| text.unwrap_or("not recorded"));
-        format!("{path}, sha256 {sha256}")
-    };
-    let ended = story.end.as_ref().map_or("not yet".to_owned(), |end| when(&end.utc));
-    let facts = [
-        ("Serial number", first.part.clone()),
-        ("Run", story.start.run.clone().unwrap_or_default()),
-        ("Recipe", source([recipe, hashes[0]])),
-        ("Cell", source([cell, hashes[1]])),
-        ("Operator", format!("{} at {}", first.actor, first.station)),
-        ("Began", when(&first.utc)),
-        ("Ended", ended),
-        ("Regrind", story.start.regrind.clone().unwrap_or_default()),
-    ];
-    let rows = facts.iter().map(|(key, value)| format!("<tr><th>{key}</th><td>{}</td></tr>\n", escaped(value)));
-    format!("<h2>Run</h2>\n<table>\n{}</table>\n", rows.collect::<String>())
-}
-
-/// Formats a time from a record in a readable form, without fractions of a second, such as "2026-01-31 09:15:00 UTC".
-/// `utc` is a time in UTC in the format RFC 3339.
-pub(super) fn when(utc: &str) -> String {
-    let second: String = utc.chars().take(19).collect();
-    format!("{} UTC", second.replacen('T', " ", 1))
+/// Returns the charts: the sections of the last map, the convergence, and the distribution of the last map.
+fn charts(report: &Report) -> String {
+    let language = report.language;
+    let figure = |svg: &str| format!("<figure>{svg}</figure>\n");
+    let mut html = String::new();
+    if let Some(last) = report.maps.last() {
+        let sections: String = last.sections(language).iter().map(|svg| figure(svg)).collect();
+        let _ = write!(html, "<h2>{}</h2>\n<div class=\"two\">\n{sections}</div>\n", report.say(Text::Sections));
+    }
+    let others =
+        convergence(report.story, language).into_iter().chain(report.maps.last().map(|m| m.distribution(language)));
+    let others: String = others.map(|svg| figure(&svg)).collect();
+    if others.is_empty() { html } else { format!("{html}<div class=\"two\">\n{others}</div>\n") }
 }
 
 /// Returns the HTML table of the cycles. Each measurement has a row with its verdict and figures, and a second row with
 /// the reason for the verdict and remarks.
-fn cycles(story: &RunHistory) -> String {
+fn cycles(report: &Report) -> String {
+    let story = report.story;
     let tolerance = story.tolerance();
     let named = |m: &Measurement| Some(tolerance.as_ref()?.compare(m.figures.as_ref()?)[0].name);
     let named = story.cycles.values().flat_map(|cycle| &cycle.measurements).filter_map(named).next_back();
     let mut html = format!(
-        "<h2>Cycles</h2>\n<table id=\"cycles\">\n<tr><th class=\"n\">cycle</th><th>judged</th><th class=\"n\">{}, \u{b5}m</th>\
-         <th class=\"n\">RMS, \u{b5}m</th><th class=\"n\">points</th><th class=\"n\">outliers</th>\
-         <th class=\"n\">coverage</th><th class=\"n\">level, \u{b5}m</th></tr>\n",
-        named.unwrap_or("PV")
+        "<h2>{}</h2>\n<table id=\"cycles\">\n<thead><tr><th class=\"n\">{}</th><th>{}</th><th class=\"n\">{}, \u{b5}m</th>\
+         <th class=\"n\">RMS, \u{b5}m</th><th class=\"n\">{}</th><th class=\"n\">{}</th>\
+         <th class=\"n\">{}</th><th class=\"n\">{}, \u{b5}m</th></tr></thead>\n",
+        report.say(Text::Cycles),
+        report.say(Text::Cycle),
+        report.say(Text::Judged),
+        named.unwrap_or("PV"),
+        report.say(Text::Points),
+        report.say(Text::Outliers),
+        report.say(Text::Coverage),
+        report.say(Text::Level),
     );
     for (number, cycle) in &story.cycles {
         let level = cycle.level_um.map_or("-".to_owned(), |level| format!("{level:.1}"));
@@ -269,11 +167,7 @@ fn cycles(story: &RunHistory) -> String {
     let touches = story.touches.map_or(String::new(), |TouchCounts { taken, whole_patterns }| {
         format!("<p>Adaptive measurement: {taken} touches; whole patterns would need {whole_patterns}.</p>\n")
     });
-    html + "</table>\n"
-        + &touches
-        + &parameters(story)
-        + "<p>Deviations are along the normal, positive where material is proud; \u{b1} is the expanded uncertainty \
-            (k = 2). The level is the height of the target surface above the nominal surface.</p>\n"
+    html + "</table>\n" + &touches + &parameters(story)
 }
 
 /// Returns the HTML table of the estimated errors of machine parameters, such as the error of the wheel radius. Each
@@ -320,6 +214,11 @@ fn parameters(story: &RunHistory) -> String {
          <th class=\"n\">deviation</th><th class=\"n\">compensated</th><th class=\"n\">correction of the next pass</th>\
          <th class=\"n\">reduces the error by, \u{b5}m rms</th></tr>\n{rows}</table>\n{left}"
     )
+}
+
+/// Formats a length in micrometres with two decimals.
+fn um(mm: f64) -> String {
+    format!("{:.2}", 1e3 * mm)
 }
 
 fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, level: &str) -> String {
@@ -375,25 +274,43 @@ fn judgement_of(measurement: &Measurement) -> (String, String) {
     (verdict_words(last), format!("{}{earlier}", last.reason))
 }
 
-fn alarms(story: &RunHistory) -> String {
-    let row = |told: &super::run_history::AlarmHistory| {
-        let withdrawn = told.withdrawn.as_deref().map_or("not withdrawn".to_owned(), when);
-        [when(&told.raised), withdrawn, alarm_words(&told.alarm), role_words(&told.alarm)]
-    };
-    let heads = ["raised", "withdrawn", "cause, consequence, remedy", "cleared by"];
-    table("Alarms", "alarms", "No alarm was raised.", heads, story.alarms.iter().map(row))
+/// Returns the definitions of the figures, with the rule by which the part was judged.
+fn definitions(report: &Report) -> String {
+    let Some(tolerance) = report.story.tolerance() else { return String::new() };
+    let pv = report.say(match tolerance.pv_points {
+        PvPoints::All => Text::PvOfPoints,
+        PvPoints::MostPoints => Text::PvOfAperture,
+    });
+    let [title, text] = [Text::Definitions, Text::Definition].map(|text| report.say(text));
+    format!("<h2>{title}</h2>\n<p>{text} {pv}</p>\n")
 }
 
-fn orders(story: &RunHistory) -> String {
-    let row = |order: &super::run_history::Order| {
+fn alarms(report: &Report) -> String {
+    let row = |told: &AlarmHistory| {
+        let withdrawn = told.withdrawn.as_deref().map_or(report.say(Text::NotWithdrawn).to_owned(), when);
+        [when(&told.raised), withdrawn, texts::alarm(&told.alarm, report.language), role_words(&told.alarm)]
+    };
+    let heads = [Text::Raised, Text::Withdrawn, Text::CauseAndRemedy, Text::ClearedBy];
+    table(report, [Text::Alarms, Text::NoAlarm], "alarms", heads, report.story.alarms.iter().map(row))
+}
+
+fn orders(report: &Report) -> String {
+    let row = |order: &Order| {
         let record = &order.record;
         [when(&record.utc), format!("{} at {}", record.actor, record.station), order.words(), order.answer()]
     };
-    let heads = ["given", "by", "order", "answer"];
-    table("Orders and confirmations", "orders", "No order was given.", heads, story.orders.iter().map(row))
+    let heads = [Text::Given, Text::By, Text::Order, Text::Answer];
+    table(report, [Text::OrdersAndConfirmations, Text::NoOrder], "orders", heads, report.story.orders.iter().map(row))
 }
 
-fn table(title: &str, id: &str, none: &str, heads: [&str; 4], rows: impl Iterator<Item = [String; 4]>) -> String {
+fn table(
+    report: &Report,
+    [title, none]: [Text; 2],
+    id: &str,
+    heads: [Text; 4],
+    rows: impl Iterator<Item = [String; 4]>,
+) -> String {
+    let [title, none] = [title, none].map(|text| report.say(text));
     let rows: String = rows
         .map(|row| {
             let [first, second, third, fourth] = row.map(|cell| escaped(&cell));
@@ -405,6 +322,6 @@ fn table(title: &str, id: &str, none: &str, heads: [&str; 4], rows: impl Iterato
     if rows.is_empty() {
         return format!("<h2>{title}</h2>\n<p>{none}</p>\n");
     }
-    let heads: String = heads.iter().map(|head| format!("<th>{head}</th>")).collect();
-    format!("<h2>{title}</h2>\n<table id=\"{id}\">\n<tr>{heads}</tr>\n{rows}</table>\n")
+    let heads: String = heads.iter().map(|head| format!("<th>{}</th>", report.say(*head))).collect();
+    format!("<h2>{title}</h2>\n<table id=\"{id}\">\n<thead><tr>{heads}</tr></thead>\n{rows}</table>\n")
 }

@@ -129,6 +129,22 @@ impl Svg {
         ));
     }
 
+    /// Draws a cross at `[x, y]` with a text beside it, both on a white edge so that they are seen on any colour. The text
+    /// is to the left of the cross if `is_left` is true.
+    pub(super) fn cross(&mut self, [x, y]: [f64; 2], content: &str, is_left: bool) {
+        let path = format!("M{:.2},{:.2}l8,8m0,-8l-8,8", x - 4.0, y - 4.0);
+        let (at, anchor) = if is_left { (x - 8.0, "end") } else { (x + 8.0, "start") };
+        let content = escaped(content);
+        for (colour, wide) in [("#ffffff", 4.0), (INK, 1.3)] {
+            self.put(format_args!("<path d=\"{path}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"{wide}\"/>\n"));
+        }
+        self.put(format_args!(
+            "<text x=\"{at:.2}\" y=\"{:.2}\" text-anchor=\"{anchor}\" stroke=\"#ffffff\" stroke-width=\"3\" \
+             paint-order=\"stroke\" stroke-linejoin=\"round\">{content}</text>\n",
+            y + 4.0
+        ));
+    }
+
     /// Draws a rectangle around the plotting area, the ticks of the x axis below it and the ticks of the y axis on its
     /// left, with their labels, and the labels of both axes. If `frame.grid` is true, grid lines cross the rectangle at
     /// the ticks.
@@ -147,7 +163,9 @@ impl Svg {
         }
         self.rectangle([left, top], [width, height], "none");
         self.text([left + width / 2.0, bottom + 39.0], Anchor::Middle, SMALL, frame.x_label);
-        self.upright([left - 46.0, top + height / 2.0], frame.y_label);
+        if !frame.y_label.is_empty() {
+            self.upright([left - 46.0, top + height / 2.0], frame.y_label);
+        }
     }
 
     /// Draws the text `content` in one line. `anchor` selects the start, the middle or the end of the baseline, and

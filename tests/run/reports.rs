@@ -9,7 +9,7 @@ use regrind::cell::{
     Verdict, sample_events,
 };
 use regrind::journal::{Entry, Header, Journal, Reader, RecordKind};
-use regrind::report::{run_report, write_run_report};
+use regrind::report::{Language, run_report, write_run_report};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -22,7 +22,7 @@ impl Page {
     /// Returns the report in the folder of a run, after a check that it equals the one generated from the record.
     pub fn read(folder: &Path) -> Self {
         let html = fs::read_to_string(folder.join("report.html")).unwrap();
-        assert_eq!(html, run_report(folder).unwrap());
+        assert_eq!(html, run_report(folder, Language::En).unwrap());
         Self { html }
     }
 
@@ -161,34 +161,30 @@ fn means_registration_and_signatures(page: &Page, folder: &Path, cycles: usize) 
     assert!(registration[0].contains("converged in ") && registration[0].contains(&used), "{registration:?}");
     let x = 1e3 * found["standard_uncertainty"]["x_mm"].as_f64().unwrap();
     assert!(registration[1].starts_with(&format!("shift {x:.2} ")), "{registration:?}");
-    assert_eq!(page.rows("signatures").len(), 4);
+    let fields = page.texts(|node| node.attribute("id") == Some("signatures")).concat();
+    for field in ["recipe approved by", "made by", "checked by", "released by"] {
+        assert!(fields.contains(field), "{field}: {fields}");
+    }
 }
 
-/// Checks that the first and the last map are drawn on one scale, and the last one also on its own, each with axes,
-/// colour bar and a name.
+/// Checks that the last map is drawn on the scale of the tolerance and on its own, and the first map on its own, each with
+/// axes, its extremes and its scale in words; and that the sections, the convergence and the distribution are drawn.
 fn maps_are_drawn(page: &Page, cycles: usize) {
-    let (others, figures): (Vec<_>, Vec<_>) =
-        page.texts(|node| node.has_tag_name("figure")).into_iter().partition(|figure| !figure.contains("scale"));
-    assert_eq!((others.len(), figures.len()), (2, 3));
-    assert!(others[0].contains("Convergence") && others[0].contains("limit of RMS"), "{others:?}");
-    assert!(others[1].contains("filtered map") && others[1].contains("SN 12"), "{others:?}");
-    for (figure, cycle) in figures.iter().zip([1, cycles, cycles]) {
-        for words in [
-            &format!("Cycle {cycle}, 20"),
-            "UTC (SIMULATION)",
-            "free-form mirror, SN 12",
-            "x / mm",
-            "y / mm",
-            "deviation / \u{b5}m",
-            "PV of the map",
-        ] {
+    let figures = page.texts(|node| node.has_tag_name("figure"));
+    let (maps, charts): (Vec<_>, Vec<_>) = figures.into_iter().partition(|figure| figure.contains("scale"));
+    assert_eq!((maps.len(), charts.len()), (3, 4), "{charts:?}");
+    let scales = [(cycles, "scale of the tolerance"), (cycles, "own scale"), (1, "scale of this map")];
+    for (figure, (cycle, scale)) in maps.iter().zip(scales) {
+        for words in [&format!("Cycle {cycle}, {scale}."), "mm", "\u{b5}m", "+"] {
             assert!(figure.contains(words), "{words}: {figure}");
         }
     }
-    // The labels after the vertical name of y are those of the colour bar.
-    let bar = |figure: &str| figure.split("y / mm").nth(1).unwrap().split("deviation").next().unwrap().to_owned();
-    assert_eq!(bar(&figures[0]), bar(&figures[1]));
-    assert_ne!(bar(&figures[1]), bar(&figures[2]));
+    for (figure, words) in
+        charts.iter().zip(["along x, at y", "along y, at x", "Convergence", "Distribution of the error"])
+    {
+        assert!(figure.contains(words), "{words}: {figure}");
+    }
+    assert!(charts[2].contains("RMS limit 1.00") && charts[3].contains(" nodes"), "{charts:?}");
 }
 
 #[test]
@@ -210,14 +206,15 @@ fn report_shows_figures_with_limits() {
     assert_eq!(judged.len(), 2, "{judged:?}");
     for (row, (name, [found, low, high], limit)) in judged.iter().zip(expected) {
         assert!(row[0].starts_with(name), "{row:?}");
-        let (expanded, between) = (format!("\u{b1} {:.2}", 0.5 * (high - low)), format!("{low:.2} to {high:.2}"));
+        let (expanded, between) = (format!("\u{b1} {:.2}", 0.5 * (high - low)), format!("{low:.2} \u{2026} {high:.2}"));
         assert_eq!(row[1..5], [format!("{found:.2}"), expanded, between, format!("{limit:.2}")], "{row:?}");
-        assert!(row[5].starts_with("P(in tolerance)"), "{row:?}");
-        assert!(row[6].contains("within the limit") && row[6].contains(&format!("at most {high:.2}")), "{row:?}");
+        assert!(row[6].starts_with("> 9") && row[6].ends_with(" %"), "{row:?}");
+        assert!(row[7].contains("within the limit") && row[7].contains(&format!("at most {high:.2}")), "{row:?}");
     }
-    let bold = page.texts(|node| node.has_tag_name("strong"));
+    let large = page.texts(|node| node.attribute("class") == Some("n big"));
     let medians = ["pv_robust", "rms"].map(|figure| format!("{:.2}", form(figure)[0]));
-    assert_eq!(bold, medians, "one figure of each judges");
+    assert_eq!(large, medians, "one figure of each judges");
+    assert_eq!(page.texts(|node| node.has_tag_name("strong")), ["ACCEPTED"]);
     assert!(page.says("ISO 14253-1"));
     // Estimated figures of the form, each next to the raw figure.
     let told = json_in(&folder, &format!("cycle-{last}/figures.json"))["form"].clone();
@@ -346,7 +343,7 @@ impl RecordWriter {
         let Self { home, journal, at } = self;
         let folder = journal.folder().to_owned();
         journal.close(at, 1, json!({ "simulation": false, "ending": ending, "cycles": [] })).unwrap();
-        write_run_report(&folder).unwrap();
+        write_run_report(&folder, regrind::report::Language::En).unwrap();
         (home, folder)
     }
 }
@@ -492,8 +489,8 @@ fn report_without_limits_invents_none() {
     };
     let (_home, folder) = of(json!({ "plan": { "tolerance": tolerance } }));
     let judged = Page::read(&folder).rows("judged");
-    assert!(judged[0][4] == "no limit" && judged[0][5].is_empty(), "{judged:?}");
-    assert!(judged[1][4] == "1.00" && !judged[1][5].is_empty(), "{judged:?}");
+    assert!(judged[0][4] == "no limit" && judged[0][6].is_empty(), "{judged:?}");
+    assert!(judged[1][4] == "1.00" && !judged[1][6].is_empty(), "{judged:?}");
     let (_home, folder) = of(Value::Null);
     let page = Page::read(&folder);
     assert!(page.rows("judged").is_empty() && page.cycles().len() == 1);
@@ -508,4 +505,42 @@ pub fn tolerance() -> Tolerance {
         probability: Tolerance::DEFAULT_PROBABILITY,
         pv_points: PvPoints::MostPoints,
     }
+}
+
+/// The report in each language: its texts and numbers are in the language, and `audit verify` knows it as unchanged.
+#[test]
+fn report_in_every_language() {
+    let home = tempfile::tempdir().unwrap();
+    let arguments = arguments(&small_recipe(home.path(), 1e4));
+    let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());
+    assert_eq!(code, 0, "{out}{errors}");
+    let folder = the_run(home.path());
+    let path = folder.to_str().unwrap();
+    for (language, words) in [
+        (
+            "de",
+            [
+                "ANGENOMMEN",
+                "Beurteilte Kenngrößen",
+                "Schnitte durch die Extremwerte",
+                "7,00",
+                "counter(page) \" von \"",
+            ],
+        ),
+        ("zh", ["合格", "判定的指标", "经过极值的截面", "7.00", "counter(page) \" / \""]),
+        ("en", ["ACCEPTED", "Judged figures", "Sections through the extremes", "7.00", "counter(page) \" of \""]),
+    ] {
+        assert_eq!(run(&["report", path, "--language", language], home.path()).0, 0);
+        let html = fs::read_to_string(folder.join("report.html")).unwrap();
+        roxmltree::Document::parse(html.strip_prefix("<!DOCTYPE html>\n").unwrap()).unwrap();
+        for piece in words {
+            assert!(html.contains(piece), "{language}: {piece}");
+        }
+        let (code, said, _) = run(&["audit", "verify", path], home.path());
+        assert!(code == 0 && !said.contains("report.html"), "{said}");
+        // No figure of ISO 10110 and no hash of a key breaks within itself.
+        assert!(html.contains("<code class=\"whole\">3/"), "{language}");
+    }
+    let (code, _, errors) = run(&["report", path, "--language", "fr"], home.path());
+    assert!(code == 2 && errors.contains("en, de, zh"), "{errors}");
 }

@@ -1,0 +1,39 @@
+//! Content that all parts of a report have in common.
+
+use super::maps::CycleMap;
+use super::run_history::RunHistory;
+use super::texts::ReportText as Text;
+use regrind_journal::Verified;
+use regrind_language::Language;
+
+/// Content of a report.
+pub(super) struct Report<'r> {
+    pub(super) story: &'r RunHistory,
+    pub(super) verified: &'r Verified,
+    /// Maps of the first and of the last cycle.
+    pub(super) maps: Vec<CycleMap>,
+    pub(super) language: Language,
+}
+
+impl Report<'_> {
+    /// Returns a text in the language of the report.
+    pub(super) fn say(&self, text: Text) -> &'static str {
+        text.to(self.language)
+    }
+
+    /// Returns the serial number of the part, or the name of the run if it has none.
+    pub(super) fn serial(&self) -> &str {
+        self.story.begin.as_ref().map_or_else(|| self.run(), |begin| &begin.part)
+    }
+
+    pub(super) fn run(&self) -> &str {
+        self.story.start.run.as_deref().unwrap_or_default()
+    }
+}
+
+/// Formats a time from a record in a readable form, without fractions of a second, such as "2026-01-31 09:15:00 UTC".
+/// `utc` is a time in UTC in the format RFC 3339.
+pub(super) fn when(utc: &str) -> String {
+    let second: String = utc.chars().take(19).collect();
+    format!("{} UTC", second.replacen('T', " ", 1))
+}
