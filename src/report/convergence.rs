@@ -50,7 +50,7 @@ pub(super) fn convergence(story: &RunHistory, language: Language) -> Option<Stri
     let chart = Chart {
         title: Text::Convergence.to(language).to_owned(),
         size: [400.0, 180.0],
-        right_margin: 140.0,
+        right_margin: 155.0,
         x: ChartAxis::of_integers(Text::Cycle.to(language), [*first, *last], 12),
         y: ChartAxis::new("\u{b5}m", Scale::Log, [low / 1.6, 1.2 * high], 9, &number),
         layers: vec![layer(0), layer(1)],

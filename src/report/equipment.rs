@@ -1,4 +1,4 @@
-//! Equipment that made and measured a part, quality of its registration, and the fields for signatures.
+//! Equipment that made and measured a part, and quality of its registration.
 
 use std::fmt::Write;
 use std::fs;
@@ -8,40 +8,42 @@ use std::path::Path;
 use serde_json::Value;
 
 use super::ReportError;
+use super::report_content::Report;
 use super::run_history::RunHistory;
+use super::texts::ReportText as Text;
 use regrind_cell::Device;
 use regrind_formats::run_files::CycleFile;
 use regrind_formats::{FormatError, escaped};
+use regrind_language::decimal;
 
-/// Returns the HTML table of the machines, the wheel and the probe of a run. `story` is the history of the run from its
-/// record. `registration` is the content of the newest file `registration.json`, or `None` if there is no such file. A
-/// value that is not on record is shown as "not reported".
-pub(super) fn equipment(story: &RunHistory, registration: Option<&Value>) -> String {
-    let not_told = || "not reported".to_owned();
+/// Returns the HTML table of the machines, the wheel and the probe of a run. `registration` is the content of the newest
+/// file `registration.json`, or `None` if there is no such file. A value that is not on record is shown as not reported.
+pub(super) fn equipment(report: &Report, registration: Option<&Value>) -> String {
+    let story = report.story;
     let machine = |device: Device| {
         let [name, address] = story.machines[device as usize].clone()?;
         Some(format!("{name}, {address}"))
     };
-    let wheel = story.wheel_radius_mm.map(|mm| format!("radius {mm:.4} mm, as the grinder reported for its last pass"));
-    let radius = registration.and_then(|found| found["probe_radius_mm"].as_f64()).filter(|mm| *mm > 0.0);
-    let off = story.radius_error_mm.map(|(cycle, mm)| {
-        format!(
-            "; the radius measured on the reference sphere in cycle {cycle} differs by {:.2} \u{b5}m from the recipe",
-            1e3 * mm
-        )
-    });
-    let probe = radius.map(|mm| format!("radius {mm:.5} mm{}", off.unwrap_or_default()));
+    let number = |value: f64, digits: usize| decimal(value, digits, report.language);
+    let radius = |mm: f64, digits: usize| format!("{} {} mm", report.say(Text::Radius), number(mm, digits));
+    let wheel = story.wheel_radius_mm.map(|mm| format!("{}, {}", radius(mm, 4), report.say(Text::LastPass)));
+    let probe_mm = registration.and_then(|found| found["probe_radius_mm"].as_f64()).filter(|mm| *mm > 0.0);
+    let off = story
+        .radius_error_mm
+        .map(|(cycle, mm)| format!("; {} {cycle}: {} \u{b5}m", report.say(Text::SphereRadius), number(1e3 * mm, 2)));
+    let probe = probe_mm.map(|mm| format!("{}{}", radius(mm, 5), off.unwrap_or_default()));
     let rows = [
-        ("Measuring machine", machine(Device::Cmm)),
-        ("Grinder", machine(Device::Grinder)),
-        ("Wheel", wheel),
-        ("Probe", probe),
+        (Text::MeasuringMachine, machine(Device::Cmm)),
+        (Text::Grinder, machine(Device::Grinder)),
+        (Text::Wheel, wheel),
+        (Text::Probe, probe),
     ];
-    let row = |(key, value): (&str, Option<String>)| {
-        format!("<tr><th>{key}</th><td>{}</td></tr>\n", escaped(&value.unwrap_or_else(not_told)))
+    let row = |(key, value): (Text, Option<String>)| {
+        let value = value.unwrap_or_else(|| report.say(Text::NotReported).to_owned());
+        format!("<tr><th>{}</th><td>{}</td></tr>\n", report.say(key), escaped(&value))
     };
     let rows: String = rows.into_iter().map(row).collect();
-    format!("<h2>Machines, wheel and probe</h2>\n<table id=\"means\">\n{rows}</table>\n")
+    format!("<h2>{}</h2>\n<table id=\"means\">\n{rows}</table>\n", report.say(Text::Machines))
 }
 
 /// Reads the file `model.json` of the last cycle whose measurement was registered. `story` is the history of the run
@@ -72,30 +74,37 @@ pub(super) fn last_registration(story: &RunHistory, folder: &Path) -> Result<Opt
 /// Returns two HTML tables about the registration of a cycle: the quality of the fit with the uncertainty of the pose,
 /// and the uncertainty budget. `found` is the content of `registration.json`, and `model` the content of `model.json`.
 /// If `model` is `None` or contains no budget, the second table is omitted.
-pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> String {
-    let number = |key: &str| found[key].as_f64();
+pub(super) fn registered(report: &Report, cycle: u32, found: &Value, model: Option<&Value>) -> String {
+    let number = |value: f64, digits: usize| decimal(value, digits, report.language);
     let count = |key: &str| found[key].as_array().map_or(0, Vec::len);
-    let um = |mm: f64| format!("{:.2} \u{b5}m", 1e3 * mm);
+    let um = |mm: f64| format!("{} \u{b5}m", number(1e3 * mm, 2));
     // A locked direction has no uncertainty in one file, and 0 in the other.
     let place = |stated: &Value| {
         let sigma = |key: &str| stated[key].as_f64().filter(|sigma| *sigma > 0.0);
-        let shift = ["x_mm", "y_mm", "z_mm"].map(|key| sigma(key).map_or("locked".to_owned(), um)).join(", ");
+        let locked = || report.say(Text::Locked).to_owned();
+        let shift = ["x_mm", "y_mm", "z_mm"].map(|key| sigma(key).map_or_else(locked, um)).join("; ");
         let turn = ["rx_rad", "ry_rad", "rz_rad"]
-            .map(|key| sigma(key).map_or("locked".to_owned(), |rad| format!("{:.2} \u{b5}rad", 1e6 * rad)));
-        format!("shift {shift} along x, y, z; rotation {} about x, y, z", turn.join(", "))
+            .map(|key| sigma(key).map_or_else(locked, |rad| format!("{} \u{b5}rad", number(1e6 * rad, 2))));
+        format!("{}: {shift}. {}: {}", report.say(Text::Shift), report.say(Text::Rotation), turn.join("; "))
     };
-    let frame = model.map_or("not on record".to_owned(), |model| place(&model["frame_standard_uncertainty"]));
-    let converged = if found["converged"] == true { "converged" } else { "not converged" };
-    let points = |key: &str| number(key).map_or("-".to_owned(), |n| format!("{n:.0}"));
-    let verdict = format!(
-        "{converged} in {} steps; {} of {} points used, {} outliers, {} points off the part; {:.1} % of the surface covered; RMS {}",
+    let frame =
+        model.map_or(report.say(Text::NotOnRecord).to_owned(), |model| place(&model["frame_standard_uncertainty"]));
+    let converged = report.say(if found["converged"] == true { Text::Converged } else { Text::NotConverged });
+    let points = |key: &str| found[key].as_f64().map_or("-".to_owned(), |n| format!("{n:.0}"));
+    let fit = format!(
+        "{converged}, {} {}; {} / {} {}; {} {}; {} {}; {} % {}; RMS {}",
         points("iterations"),
+        report.say(Text::Steps),
         points("used"),
         points("points"),
+        report.say(Text::PointsUsed),
         count("outliers"),
+        report.say(Text::Outliers),
         count("off_part"),
-        100.0 * number("coverage").unwrap_or(f64::NAN),
-        number("rms_mm").map_or("-".to_owned(), um)
+        report.say(Text::PointsOffPart),
+        found["coverage"].as_f64().map_or("-".to_owned(), |share| number(100.0 * share, 1)),
+        report.say(Text::SurfaceCovered),
+        found["rms_mm"].as_f64().map_or("-".to_owned(), um)
     );
     let words = |key: &str, of: fn(&Value) -> Option<&str>| -> Vec<String> {
         found[key].as_array().into_iter().flatten().filter_map(of).map(str::to_owned).collect()
@@ -103,62 +112,66 @@ pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> St
     let mut remarks = words("weak_directions", |weak| weak["words"].as_str());
     remarks.extend(words("warnings", Value::as_str));
     if count("alternatives") > 0 {
-        remarks.push(format!("{} other poses of the part fit the points about equally well", count("alternatives")));
+        remarks.push(format!("{} {}", count("alternatives"), report.say(Text::OtherPoses)));
     }
-    let remarks = if remarks.is_empty() { "none".to_owned() } else { remarks.join("; ") };
-    let mut html = format!("<h2>Registration, cycle {cycle}</h2>\n<table id=\"registration\">\n");
+    let remarks = if remarks.is_empty() { report.say(Text::None).to_owned() } else { remarks.join("; ") };
+    let [title, of_cycle] = [Text::Registration, Text::Cycle].map(|text| report.say(text));
+    let mut html = format!("<h2>{title}, {of_cycle} {cycle}</h2>\n<table id=\"registration\">\n");
     for (key, value) in [
-        ("Fit", verdict),
-        ("Repeatability of the pose (standard uncertainty)", place(&found["standard_uncertainty"])),
-        ("Standard uncertainty of the nominal coordinate frame, including the uncertainty of the form", frame),
-        ("Remarks", remarks),
+        (Text::Fit, fit),
+        (Text::Repeatability, place(&found["standard_uncertainty"])),
+        (Text::FrameUncertainty, frame),
+        (Text::Remarks, remarks),
     ] {
-        let _ = writeln!(html, "<tr><th>{key}</th><td>{}</td></tr>", escaped(&value));
+        let _ = writeln!(html, "<tr><th>{}</th><td>{}</td></tr>", report.say(key), escaped(&value));
     }
-    html + "</table>\n" + &model.map_or(String::new(), budget)
+    html + "</table>\n" + &model.map_or(String::new(), |model| budget(report, model))
 }
 
 /// Returns the HTML table of the uncertainty budget of RMS and PV 99.8 %, with a row for each source of uncertainty.
 /// Returns an empty text if `model`, the content of `model.json`, contains no budget.
-fn budget(model: &Value) -> String {
+fn budget(report: &Report, model: &Value) -> String {
     let Some(shares) = model["budget"].as_array().filter(|shares| !shares.is_empty()) else { return String::new() };
+    let number = |mm: f64| decimal(1e3 * mm, 3, report.language);
     let um = |share: &Value, key: &str| match (share["is_stated"] == true, share[key].as_f64()) {
-        (true, Some(mm)) => format!("{:.3}", 1e3 * mm),
-        _ => "not stated".to_owned(),
+        (true, Some(mm)) => number(mm),
+        _ => report.say(Text::NotStated).to_owned(),
     };
     let rows = shares.iter().map(|share| {
-        let source = source_words(share["source"].as_str().unwrap_or_default());
+        let name = share["source"].as_str().unwrap_or_default();
+        let source = source(name).map_or(name, |text| report.say(text));
         let [rms, pv] = ["rms_mm", "pv_99_8_mm"].map(|key| um(share, key));
         format!("<tr><td>{}</td><td class=\"n\">{rms}</td><td class=\"n\">{pv}</td></tr>\n", escaped(source))
     });
     let whole = |key: &str| {
         let squares = shares.iter().filter_map(|share| share[key].as_f64()).map(|mm| mm * mm);
-        format!("{:.3}", 1e3 * squares.sum::<f64>().sqrt())
+        number(squares.sum::<f64>().sqrt())
     };
+    let [title, source, rms, pv, combined, sum] =
+        [Text::Budget, Text::Source, Text::ShareOfRms, Text::ShareOfPv, Text::Combined, Text::SquaresAddUp]
+            .map(|text| report.say(text));
     format!(
-        "<h2>Uncertainty budget</h2>\n<table id=\"budget\">\n<tr><th>source of standard uncertainty</th>\
-         <th class=\"n\">of the RMS, \u{b5}m</th><th class=\"n\">of the PV 99.8 %, \u{b5}m</th></tr>\n{}\
-         <tr><th>combined</th><td class=\"n\">{}</td><td class=\"n\">{}</td></tr>\n</table>\n\
-         <p>The squares add up. A source that neither the cell file nor the recipe states counts as 0.</p>\n",
+        "<h2>{title}</h2>\n<table id=\"budget\">\n<thead><tr><th>{source}</th>\
+         <th class=\"n\">{rms}, \u{b5}m</th><th class=\"n\">{pv}, \u{b5}m</th></tr></thead>\n{}\
+         <tr><th>{combined}</th><td class=\"n\">{}</td><td class=\"n\">{}</td></tr>\n</table>\n<p>{sum}</p>\n",
         rows.collect::<String>(),
         whole("rms_mm"),
         whole("pv_99_8_mm")
     )
 }
 
-/// Returns the description, for people, of a source of uncertainty. `name` is the name of the source in `model.json`;
-/// an unknown name is returned unchanged.
-fn source_words(name: &str) -> &str {
-    match name {
-        "scatter" => "noise of the probe",
-        "form" => "form between the measured points",
-        "pose" => "pose of the part",
-        "radius" => "radius of the probe and of the reference sphere",
-        "scales" => "scales of the machine",
-        "squareness" => "squareness of the machine",
-        "probe" => "error of the probe that depends on the direction",
-        "temperature" => "temperature and expansion",
-        "datum" => "position of the part in the fixture",
-        other => other,
-    }
+/// Returns the text of a source of uncertainty. `name` is the name of the source in `model.json`.
+fn source(name: &str) -> Option<Text> {
+    Some(match name {
+        "scatter" => Text::SourceScatter,
+        "form" => Text::SourceForm,
+        "pose" => Text::SourcePose,
+        "radius" => Text::SourceRadius,
+        "scales" => Text::SourceScales,
+        "squareness" => Text::SourceSquareness,
+        "probe" => Text::SourceProbe,
+        "temperature" => Text::SourceTemperature,
+        "datum" => Text::SourceDatum,
+        _ => return None,
+    })
 }

@@ -212,7 +212,11 @@ fn maps(report: &Report) -> Result<String, ReportError> {
         let Some(limit_um) = limit_um else { continue };
         let cycle = report.say(Text::Cycle);
         let caption = format!("{} {}, {}.", capitalized(cycle), last.cycle, report.say(text));
-        let _ = writeln!(html, "<figure>{}<figcaption>{caption}</figcaption></figure>", last.picture(limit_um)?);
+        let _ = writeln!(
+            html,
+            "<figure class=\"map\">{}<figcaption>{caption}</figcaption></figure>",
+            last.picture(limit_um)?
+        );
     }
     let [sign, filtered] = [Text::SignOfMap, Text::MapsFiltered].map(|text| report.say(text));
     Ok(html + &format!("</div>\n<p class=\"caption\">{sign} {filtered}</p>\n"))
@@ -232,7 +236,10 @@ fn how_it_got_there(report: &Report) -> Result<String, ReportError> {
                 first.cycle,
                 report.say(Text::ScaleOfFirst)
             );
-            format!("<figure>{}<figcaption>{caption}</figcaption></figure>\n", first.picture(first.own_limit_um())?)
+            format!(
+                "<figure class=\"map\">{}<figcaption>{caption}</figcaption></figure>\n",
+                first.picture(first.own_limit_um())?
+            )
         }
         _ => String::new(),
     };

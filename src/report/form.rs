@@ -9,24 +9,25 @@ use serde_json::Value;
 
 use super::ReportError;
 use super::axis::three_digits;
-use super::run_history::RunHistory;
+use super::report_content::Report;
+use super::texts::ReportText as Text;
 use regrind_formats::{FormatError, escaped};
 
 /// Returns the HTML section about the form of the surface. Its tables have a row for each figure, such as PV, and a
-/// column for each cycle that has figures. `story` is the history of the run from its record, and `folder` the run
-/// folder. Returns an empty text if no cycle has figures.
+/// column for each cycle that has figures. `folder` is the run folder. Returns an empty text if no cycle has figures.
 ///
 /// # Errors
 /// Fails if a file of figures cannot be read or is not JSON.
-pub(super) fn form(story: &RunHistory, folder: &Path) -> Result<String, ReportError> {
+pub(super) fn form(report: &Report, folder: &Path) -> Result<String, ReportError> {
     let mut cycles = Vec::new();
-    for (number, cycle) in &story.cycles {
+    for (number, cycle) in &report.story.cycles {
         let Some(name) = &cycle.form else { continue };
         cycles.push((*number, read_figures(&folder.join(name))?));
     }
     let Some((_, last)) = cycles.last() else { return Ok(String::new()) };
-    let html = format!("<h2>Form of the surface</h2>\n{}{}", estimated_figures(&cycles, last), raw(&cycles, last));
-    Ok(html + &notations(&cycles))
+    let title = report.say(Text::FormOfSurface);
+    let html = format!("<h2>{title}</h2>\n{}{}", estimated_figures(report, &cycles, last), raw(report, &cycles, last));
+    Ok(html + &notations(report, &cycles))
 }
 
 /// Reads a file `figures.json`, which holds the figures of a cycle.
@@ -47,22 +48,27 @@ fn named<'a>(figures: &'a Value, list: &str, name: &Value) -> Option<&'a Value> 
     listed(figures, list).iter().find(|row| row["name"] == *name)
 }
 
-fn heads(cycles: &[(u32, Value)]) -> String {
-    cycles.iter().map(|(number, _)| format!("<th class=\"n\">cycle {number}</th>")).collect()
+fn heads(report: &Report, cycles: &[(u32, Value)]) -> String {
+    let word = report.say(Text::Cycle);
+    cycles.iter().map(|(number, _)| format!("<th class=\"n\">{word} {number}</th>")).collect()
 }
 
 /// Returns the HTML table of the figures of the form that the model estimates without the noise of the probe. Each
 /// figure has its median and its 95 % credible interval. `cycles` contains the number and the figures of each cycle.
 /// `last` contains the figures of the last cycle, which determine the rows of the table. Returns an empty text if
 /// `last` has no estimated figures, as in files of earlier versions.
-fn estimated_figures(cycles: &[(u32, Value)], last: &Value) -> String {
+fn estimated_figures(report: &Report, cycles: &[(u32, Value)], last: &Value) -> String {
     let list = listed(last, "form");
     if list.is_empty() {
         return String::new();
     }
     let mut html = format!(
-        "<table id=\"told\">\n<thead><tr><th>figure</th>{}<th class=\"n\">raw, last cycle</th><th>unit</th><th>what it is</th></tr></thead>\n",
-        heads(cycles)
+        "<table id=\"told\">\n<thead><tr><th>{}</th>{}<th class=\"n\">{}</th><th>{}</th><th>{}</th></tr></thead>\n",
+        report.say(Text::Figure),
+        heads(report, cycles),
+        report.say(Text::RawLastCycle),
+        report.say(Text::Unit),
+        report.say(Text::Meaning),
     );
     for row in list {
         let text = |key: &str| escaped(&with_micro(row[key].as_str().unwrap_or_default()));
@@ -81,10 +87,7 @@ fn estimated_figures(cycles: &[(u32, Value)], last: &Value) -> String {
         );
     }
     let removed = escaped(list[0]["removed"].as_str().unwrap_or_default());
-    html + &format!(
-        "</table>\n<p>Figures of the form of the part without the noise of the probe: the median, and the 95 % credible interval. If an interval begins at 0, \
-         only an upper bound of the figure is known. Raw: the same figure of the measured points, which includes the noise of the probe. Removed: {removed}.</p>\n"
-    )
+    html + &format!("</table>\n<p>{}: {removed}.</p>\n", report.say(Text::FormNote))
 }
 
 /// Returns three texts from a row of `figures.json`: the median of a figure, and the lower and upper end of its
@@ -116,12 +119,16 @@ fn with_micro(text: &str) -> String {
 /// Returns the HTML table of the figures that were computed directly from the measured points and from the map. These
 /// figures include the noise of the probe. `cycles` contains the number and the figures of each cycle. `last` contains
 /// the figures of the last cycle, which determine the rows of the table.
-fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
+fn raw(report: &Report, cycles: &[(u32, Value)], last: &Value) -> String {
     let rows = listed(last, "figures");
-    let title = if listed(last, "form").is_empty() { "" } else { "<h3>Raw, as measured</h3>\n" };
+    let title = format!("<h3>{}</h3>\n", report.say(Text::RawAsMeasured));
+    let title = if listed(last, "form").is_empty() { "" } else { &title };
     let mut html = format!(
-        "{title}<table id=\"form\">\n<thead><tr><th>figure</th>{}<th>unit</th><th>what it is</th></tr></thead>\n",
-        heads(cycles)
+        "{title}<table id=\"form\">\n<thead><tr><th>{}</th>{}<th>{}</th><th>{}</th></tr></thead>\n",
+        report.say(Text::Figure),
+        heads(report, cycles),
+        report.say(Text::Unit),
+        report.say(Text::Meaning),
     );
     // The most figures have the same removed and the same wavelengths left out. Only others state theirs.
     let usual = ["removed", "cut_off"].map(|key| rows.first().and_then(|row| row[key].as_str()).unwrap_or_default());
@@ -148,27 +155,27 @@ fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
         );
     }
     let [removed, cut_off] = usual.map(|text| escaped(&with_micro(text)));
-    html + &format!("</table>\n<p>Unless stated: removed {removed}; wavelengths left out: {cut_off}.</p>\n")
+    let [unless, waves] = [Text::UnlessStated, Text::WavesLeftOut].map(|text| report.say(text));
+    html + &format!("</table>\n<p>{unless} {removed}; {waves}: {cut_off}.</p>\n")
 }
 
 /// Returns an HTML list with the tolerance indications of ISO 10110-5 (texts such as "3/A(B/C)") for each cycle. Each
 /// entry contains two indications. The form of the part meets the first one with a probability of 97.5 %. The measured
 /// points just meet the second one. The first one is omitted if the figures do not contain it. `cycles` contains the
 /// number of each cycle and its figures (the content of `figures.json`).
-fn notations(cycles: &[(u32, Value)]) -> String {
-    let mut html = "<p>The descriptions of the figures are those of the last cycle. All figures are along the outward normal, positive where material is proud; \
-                    they are figures of the surface, not of a wavefront. Indication of ISO 10110-5, in nanometres, that the form meets in each value with \
-                    a probability of 97.5 %; raw: the indication that the measured points just meet:</p>\n<ul>\n"
-        .to_owned();
+fn notations(report: &Report, cycles: &[(u32, Value)]) -> String {
+    let [intro, raw, word] = [Text::Iso10110, Text::Raw, Text::Cycle].map(|text| report.say(text));
+    let mut html = format!("<p>{intro}</p>\n<ul>\n");
     for (number, figures) in cycles {
         let notation = figures["iso_10110_5"]["notation"].as_str().unwrap_or("-");
         let of_form = figures["form_iso_10110_5"].as_str();
-        let of_form = of_form.map_or(String::new(), |of| format!("<code class=\"whole\">{}</code>; raw ", escaped(of)));
+        let of_form =
+            of_form.map_or(String::new(), |of| format!("<code class=\"whole\">{}</code>; {raw} ", escaped(of)));
         let missing = figures["missing"].as_array().into_iter().flatten().filter_map(Value::as_str);
         let missing: String = missing.map(|why| format!("; no {}", escaped(why))).collect();
         let _ = writeln!(
             html,
-            "<li>cycle {number}: {of_form}<code class=\"whole\">{}</code>{missing}</li>",
+            "<li>{word} {number}: {of_form}<code class=\"whole\">{}</code>{missing}</li>",
             escaped(notation)
         );
     }

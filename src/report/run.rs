@@ -74,13 +74,14 @@ fn html(report: &Report, folder: &Path) -> Result<String, ReportError> {
     html += "<section class=\"details\">\n";
     html += &charts(report);
     html += &registration
-        .map_or(String::new(), |(cycle, found)| registered(cycle, &found, last_model(story, folder).as_ref()));
-    html += &form(story, folder)?;
+        .map_or(String::new(), |(cycle, found)| registered(report, cycle, &found, last_model(story, folder).as_ref()));
+    html += &form(report, folder)?;
     html += &cycles(report);
-    html += &equipment(story, last_registration(story, folder)?.as_ref().map(|(_, found)| found));
+    html += &equipment(report, last_registration(story, folder)?.as_ref().map(|(_, found)| found));
     html += &alarms(report);
     html += &orders(report);
     html += &definitions(report);
+    html += &traceability(report);
     let (records, head, signed) = (verified.records, &verified.head, verified.signed);
     let by = verified.keys.iter().map(|key| format!("<br/><code>{key}</code>")).collect::<String>();
     let end = report.say(if verified.closed { Text::Closed } else { Text::NotClosed });
@@ -165,7 +166,8 @@ fn cycles(report: &Report) -> String {
         html.extend(measurements.iter().map(|of| measurement(*number, of, tolerance.as_ref(), &level)));
     }
     let touches = story.touches.map_or(String::new(), |TouchCounts { taken, whole_patterns }| {
-        format!("<p>Adaptive measurement: {taken} touches; whole patterns would need {whole_patterns}.</p>\n")
+        let [touches, whole] = [Text::Touches, Text::WholePatterns].map(|text| report.say(text));
+        format!("<p>{touches}: {taken}; {whole} {whole_patterns}.</p>\n")
     });
     html + "</table>\n" + &touches + &parameters(story)
 }
@@ -283,6 +285,32 @@ fn definitions(report: &Report) -> String {
     });
     let [title, text] = [Text::Definitions, Text::Definition].map(|text| report.say(text));
     format!("<h2>{title}</h2>\n<p>{text} {pv}</p>\n")
+}
+
+/// Returns the files from which the run was made, with their hashes, the person and the program.
+fn traceability(report: &Report) -> String {
+    let story = report.story;
+    let Some(first) = &story.begin else { return String::new() };
+    let [_, recipe, cell] = story.start.content.names();
+    let part = story.start.content.part();
+    let hashes = part.map_or([None, None, None], |part| {
+        [&part.recipe_sha256, &part.cell_sha256, &part.nominal_sha256].map(Option::as_deref)
+    });
+    let missing = report.say(Text::NotOnRecord);
+    let source = |[path, sha256]: [Option<&str>; 2]| {
+        format!("{}, sha256 {}", path.unwrap_or(missing), sha256.unwrap_or(missing))
+    };
+    let facts = [
+        (Text::Recipe, source([recipe, hashes[0]])),
+        (Text::Cell, source([cell, hashes[1]])),
+        (Text::NominalSurface, format!("sha256 {}", hashes[2].unwrap_or(missing))),
+        (Text::Operator, format!("{} at {}", first.actor, first.station)),
+        (Text::Program, format!("Regrind {}", story.start.regrind.as_deref().unwrap_or_default())),
+    ];
+    let row =
+        |(key, value): &(Text, String)| format!("<tr><th>{}</th><td>{}</td></tr>\n", report.say(*key), escaped(value));
+    let rows: String = facts.iter().map(row).collect();
+    format!("<h2>{}</h2>\n<table id=\"sources\">\n{rows}</table>\n", report.say(Text::Traceability))
 }
 
 fn alarms(report: &Report) -> String {

@@ -29,7 +29,12 @@ regrind_language::texts! {
     // Details.
     Cell Machines Cycles Points Outliers Coverage Level Judged
     OrdersAndConfirmations Raised Withdrawn NotWithdrawn CauseAndRemedy ClearedBy NoAlarm NoOrder Given By Order
-    Answer Identity HashOfLast
+    Answer Identity HashOfLast Traceability NominalSurface
+    Registration Fit Converged NotConverged Steps PointsUsed PointsOffPart SurfaceCovered Repeatability
+    FrameUncertainty Remarks Shift Rotation Locked NotOnRecord OtherPoses Budget Source ShareOfRms ShareOfPv
+    NotStated Combined SquaresAddUp SourceScatter SourceForm SourcePose SourceRadius SourceScales SourceSquareness
+    SourceProbe SourceTemperature SourceDatum FormOfSurface RawLastCycle Unit Meaning RawAsMeasured FormNote
+    UnlessStated WavesLeftOut Iso10110 Raw LastPass SphereRadius Touches WholePatterns
 }
 
 /// Returns the word for a verdict.

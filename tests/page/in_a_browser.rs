@@ -1,5 +1,6 @@
 //! The page in a browser, as a person sees it.
 
+use data_encoding::BASE64;
 use regrind_testcell::browser::{Browser, Tab};
 use regrind_testutils::sample::all;
 use serde_json::json;
@@ -370,6 +371,29 @@ fn other_views_fit_every_screen() {
             }
         }
         assert_eq!(tab.problems(&browser), Vec::<String>::new());
+    }
+}
+
+/// The report of an accepted part: four pages or fewer on A4 and on Letter, and nothing is wider than a page or a phone.
+#[test]
+#[ignore = "needs a browser: Debian package chromium"]
+fn report_prints_on_four_pages() {
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = CellPage::begin(home.path(), 1e4);
+    assert_eq!(shown.run.end().0, 0);
+    let mut browser = Browser::start(home.path());
+    let place = format!("file://{}", shown.folder.join("report.html").display());
+    let tab = browser.open(&place, [390, 844]);
+    tab.until(&mut browser, "document.querySelector('#judged')");
+    let width = tab.read(&mut browser, "document.documentElement.scrollWidth");
+    assert!(width.as_f64().unwrap() <= 390.0, "{width}");
+    for [width, height] in [[8.27, 11.69], [8.5, 11.0]] {
+        let paper = json!({ "printBackground": true, "paperWidth": width, "paperHeight": height });
+        let printed = tab.send(&mut browser, "Page.printToPDF", paper);
+        let pdf = BASE64.decode(printed["data"].as_str().unwrap().as_bytes()).unwrap();
+        let text = String::from_utf8_lossy(&pdf);
+        let pages = text.matches("/Type /Page\n").count();
+        assert!((2..=4).contains(&pages), "{width} x {height}: {pages} pages");
     }
 }
 

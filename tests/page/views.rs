@@ -53,8 +53,9 @@ fn finished_run_pages() {
         "{both:?}"
     );
     assert_eq!(visitor.get(&format!("/compare?run={}", ids[0])).header("location"), ["/runs"]);
-    let report = visitor.get(&format!("/runs/{}/report", ids[0]));
-    assert_eq!(report.body, std::fs::read(home.path().join("runs").join(ids[0]).join("report.html")).unwrap());
+    assert!(visitor.get(&format!("/runs/{}/report", ids[0])).text().contains("<html lang=\"zh\">"));
+    let report = Visitor::with_key(&url).get(&format!("/runs/{}/report", ids[0]));
+    assert!(report.body == std::fs::read(home.path().join("runs").join(ids[0]).join("report.html")).unwrap());
     assert!(report.header("content-security-policy")[0].contains("default-src 'none'"));
 
     let map = visitor.get(&format!("/runs/{}/cycles/1/map", ids[0]));

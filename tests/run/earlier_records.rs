@@ -53,9 +53,9 @@ fn earlier_records_verify_and_read_as_before() {
         assert_eq!(summary.result, result, "{name}");
         let report = run_report(&folder, regrind::report::Language::En).unwrap();
         assert!(report.contains(&summary.run) && report.contains(&summary.verdict), "{name}");
-        let cell = if ["figures", "layout-1"].contains(&name) { "not recorded" } else { "cell.toml" };
+        let cell = if ["figures", "layout-1"].contains(&name) { "not on record" } else { "cell.toml" };
         let cell = if name == "table-9" { "sim" } else { cell };
-        assert!(report.contains(&format!("<th>Cell</th><td>{cell}, sha256 ")), "{name}");
+        assert!(report.contains(&format!("<th>cell</th><td>{cell}, sha256 ")), "{name}");
         if name != "layout-1" {
             contents::assert_known(&folder);
         }

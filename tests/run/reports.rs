@@ -153,14 +153,14 @@ fn means_registration_and_signatures(page: &Page, folder: &Path, cycles: usize) 
     let found = json_in(folder, &format!("cycle-{cycles}/registration.json"));
     let radius = format!("radius {:.5} mm", found["probe_radius_mm"].as_f64().unwrap());
     assert!(means[3].starts_with(&radius), "{means:?}");
-    for piece in ["reference sphere", &format!("in cycle {cycles}")] {
+    for piece in ["reference sphere", &format!("cycle {cycles}: ")] {
         assert!(means[3].contains(piece), "{piece}: {means:?}");
     }
     let registration = cells("registration");
-    let used = format!("{} of {} points used", found["used"], found["points"]);
-    assert!(registration[0].contains("converged in ") && registration[0].contains(&used), "{registration:?}");
+    let used = format!("{} / {} points used", found["used"], found["points"]);
+    assert!(registration[0].contains("converged, ") && registration[0].contains(&used), "{registration:?}");
     let x = 1e3 * found["standard_uncertainty"]["x_mm"].as_f64().unwrap();
-    assert!(registration[1].starts_with(&format!("shift {x:.2} ")), "{registration:?}");
+    assert!(registration[1].starts_with(&format!("shift along x, y, z: {x:.2} \u{b5}m; ")), "{registration:?}");
     let fields = page.texts(|node| node.attribute("id") == Some("signatures")).concat();
     for field in ["recipe approved by", "made by", "checked by", "released by"] {
         assert!(fields.contains(field), "{field}: {fields}");
