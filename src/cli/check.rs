@@ -71,6 +71,23 @@ struct ProblemDocument {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let mut found = Vec::new();
     for path in &arguments.files {
+        if is_no_settings_file(path) {
+            let failure = Failure::NotToCheck { path: path.clone() };
+            if !arguments.json {
+                super::print(&format!("{failure}\n"))?;
+            }
+            let problem = ProblemDocument::of_file(failure.to_string());
+            let problems = vec![problem];
+            found.push(CheckedFile {
+                file: path.clone(),
+                kind: "unknown",
+                good: false,
+                sha256: None,
+                notes: Vec::new(),
+                problems,
+            });
+            continue;
+        }
         let (kind, checked) = check(path);
         if !arguments.json {
             match &checked {
@@ -99,6 +116,18 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         0 => Ok(Outcome::Accepted),
         bad => Err(Failure::Checked { bad, files: found.len() }),
     }
+}
+
+/// Returns true if the file at `path` has text, but no line of a settings file: none with an equals sign, and no head of
+/// a table.
+fn is_no_settings_file(path: &Path) -> bool {
+    let text = std::fs::read(path).map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).unwrap_or_default();
+    !text.trim().is_empty() && !text.lines().any(|line| line.contains('=') || line.trim_start().starts_with('['))
+}
+
+/// Returns true if the file at `path` is a recipe: it has the table of a part.
+pub(super) fn is_recipe(path: &Path) -> bool {
+    has_table(path, &["[part]"])
 }
 
 /// Checks the file at `path`. Returns the kind of the file ("dialect", "cell file" or "recipe") and the result. The
@@ -225,6 +254,12 @@ fn picture(problems: &Problems, problem: &Problem, renderer: &Renderer) -> Strin
 }
 
 impl ProblemDocument {
+    /// Creates the problem of a file as a whole.
+    fn of_file(found: String) -> Self {
+        let none = String::new;
+        Self { line: 1, column: 1, key: none(), found, allowed: none(), remedy: none() }
+    }
+
     fn new(problems: &Problems, problem: &Problem) -> Self {
         let (line, column) = problems.place(problem);
         let Problem { key, found, allowed, remedy, .. } = problem.clone();

@@ -261,6 +261,9 @@ fn status_text(status: &Snapshot, folder: &Path) -> String {
 /// Returns `run` if the person named a run folder. Otherwise returns the folder of the newest run in `runs`, a
 /// subfolder of the working folder. Returns an error if no run is named and `runs` contains no run.
 pub(super) fn folder_of(run: Option<&Path>) -> Result<PathBuf, Failure> {
+    if let Some(missing) = run.filter(|run| !run.exists()) {
+        return Err(Failure::NoSuchFolder { path: missing.to_owned() });
+    }
     run.map(Path::to_owned).or_else(|| newest(Path::new("runs"))).ok_or_else(|| Failure::NoRun { path: "runs".into() })
 }
 

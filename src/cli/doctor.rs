@@ -88,6 +88,9 @@ impl Finding {
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let Arguments { cell: path, recipe, runs, json } = arguments;
+    if check::is_recipe(path) {
+        return Err(Failure::RecipeForCell { path: path.clone() });
+    }
     let cell = check::or_show(CellConfig::read(path))?;
     let mut findings =
         vec![Finding::new("cell", FindingLevel::Good, format!("{} is a good cell file", path.display()))];

@@ -93,6 +93,16 @@ pub(super) enum Failure {
     ControlSocket { path: PathBuf, source: io::Error },
     #[error("{path}: this path contains no run; name the folder of a run")]
     NoRun { path: PathBuf },
+    #[error(
+        "{}: this folder does not exist; give the folder of the runs, or create it: mkdir {0}", .path.display()
+    )]
+    NoRunsFolder { path: PathBuf },
+    #[error("{}: this is neither a recipe nor a cell file nor a dialect: it has no table of one; for a file of points: regrind accuracy, or regrind register", .path.display())]
+    NotToCheck { path: PathBuf },
+    #[error("{}: this is a recipe, and `regrind doctor` checks a cell; write: regrind doctor --recipe {0}", .path.display())]
+    RecipeForCell { path: PathBuf },
+    #[error("{}: there is no such folder; `regrind runs` lists the runs", .path.display())]
+    NoSuchFolder { path: PathBuf },
     #[error("{path}: this run is not active ({source}); to see how the run ended: `regrind audit show`")]
     NotRunning { path: PathBuf, source: io::Error },
     #[error(

@@ -105,7 +105,23 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let InitSettings { folder, machines, part } = read_settings(arguments)?;
     let (recipe, shipped_name) = machines.recipe();
     let name = part.as_deref().unwrap_or(shipped_name);
-    make(&folder, machines, recipe_of(recipe, shipped_name, name), name)
+    let recipe = recipe_of(recipe, shipped_name, name);
+    // The shipped cell of people has no reference sphere; its recipe touches none.
+    let recipe = match machines {
+        Machines::Manual => recipe.replace(
+            "qualify = true              # touch the reference sphere first",
+            "qualify = false             # true: touch the reference sphere of the cell file first",
+        ),
+        _ => recipe,
+    };
+    let recipe = if name == shipped_name { recipe } else { of_other_part(&recipe) };
+    make(&folder, machines, recipe, name)?;
+    if name != shipped_name {
+        super::print(&format!(
+            "note: the surface in recipe.toml is still that of the example, {shipped_name}; replace the tables [nominal...] by the surface of {name:?}\n"
+        ))?;
+    }
+    Ok(Outcome::Accepted)
 }
 
 /// Settings of the new folder, from the arguments or from the answers of a person.
@@ -173,7 +189,7 @@ fn ask<T>(question: &str, usual: &str, read: impl Fn(&str) -> Result<T, String>)
     }
 }
 
-fn make(folder: &Path, machines: Machines, recipe: String, name: &str) -> Result<Outcome, Failure> {
+fn make(folder: &Path, machines: Machines, recipe: String, name: &str) -> Result<(), Failure> {
     let files = [
         ("recipe.toml", recipe),
         ("cell.toml", cell_of(machines.cell())),
@@ -189,8 +205,7 @@ fn make(folder: &Path, machines: Machines, recipe: String, name: &str) -> Result
         write_atomic(&folder.join(file), text.as_bytes())?;
     }
     made.keep();
-    super::print(&words(folder, machines))?;
-    Ok(Outcome::Accepted)
+    super::print(&words(folder, machines))
 }
 
 /// Returns the recipe text `shipped` with changes for a new folder. Replaces the part name `shipped_name` by `name`.
@@ -203,6 +218,23 @@ fn recipe_of(shipped: &str, shipped_name: &str, name: &str) -> String {
         .replace("docs/recipe.schema.json", "recipe.schema.json")
         .replace("recipes/freeform-mirror.toml", "recipe.toml")
         .replace("config/file-exchange.toml", "cell.toml")
+}
+
+/// Returns the recipe text without the drawing and the material of the example, and with a mark above its surface.
+fn of_other_part(recipe: &str) -> String {
+    let is_of_example = |line: &&str| ["drawing = ", "material = "].iter().any(|key| line.starts_with(key));
+    let mark = |line: &str| match line.starts_with("[nominal") {
+        true => format!("# The surface of the example: replace it by that of your part.\n{line}"),
+        false => line.to_owned(),
+    };
+    let mut is_marked = false;
+    let mut text = String::new();
+    for line in recipe.lines().filter(|line| !is_of_example(line)) {
+        let marked = if is_marked { line.to_owned() } else { mark(line) };
+        is_marked |= line.starts_with("[nominal");
+        text += &format!("{marked}\n");
+    }
+    text
 }
 
 /// Returns the text of the cell file `shipped` with changes for a new folder. Replaces the file paths, which are valid

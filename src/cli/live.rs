@@ -97,8 +97,10 @@ impl RunContext<'_> {
         // The record is closed. A failed report or a closed terminal must not change the result of the run.
         let report = regrind::report::write_run_report(self.folder, regrind::report::Language::En);
         shown??;
-        if let Err(error) = report {
-            super::print(&format!("the report was not written: {error}\n"))?;
+        match report {
+            Err(error) => super::print(&format!("the report was not written: {error}\n"))?,
+            Ok(path) if !self.json => super::print(&format!("report   {}\n", path.display()))?,
+            Ok(_) => {}
         }
         Ok(ending)
     }

@@ -12,11 +12,12 @@ use regrind::config::{BUILT_IN_CELL, CellConfig};
 use regrind::drive::Task;
 use regrind::formats::run_files::{CycleFolder, RunFile};
 use regrind::formats::{KnowledgeOrigin, Learned, LearnedError, SettingIdentity};
-use regrind::journal::{AuditKey, Header, Journal, free_bytes, utc_to_the_second};
+use regrind::journal::{AuditKey, Header, Journal, Reader, free_bytes, utc_to_the_second};
 use regrind::recipe::Recipe;
 use regrind::record::{PartStart, RecordedPlan, RunContent};
 use regrind::setup;
 
+use super::control::folders;
 use super::failure::Failure;
 use super::live::{PreparedRun, RunContext, outcome};
 use super::succession::RunPlace;
@@ -126,6 +127,20 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
+/// Returns the folder of a run in `runs` that accepted the part with the serial number `part`, the last by name.
+fn accepted_run(runs: &Path, part: &str) -> Option<PathBuf> {
+    let is_accepted = |run: &PathBuf| {
+        let result = std::fs::read(run.join(RunFile::Result.name())).ok()?;
+        let result: serde_json::Value = serde_json::from_slice(&result).ok()?;
+        if result["ending"]["ending"] != "accepted" {
+            return None;
+        }
+        let first = Reader::open(run).ok()?.records(0).next()?.ok()?;
+        Some(first.part == part)
+    };
+    folders(runs).filter(|run| is_accepted(run) == Some(true)).max()
+}
+
 /// Locks and connects the machines, creates the run folder and the journal, and executes the run until its end. Returns
 /// how the run has ended, and the process that shows its page. `earlier` is the knowledge from earlier runs, or `None` if the recipe does not use any. `key`
 /// signs the record; without a key the record is not signed. Returns an error if the disk has too little space, a
@@ -144,6 +159,10 @@ async fn carry_out(
     let job = epoch(began);
     // These checks come before the record: with a missing folder or a busy line there is no run.
     let part = arguments.part.clone().unwrap_or_else(|| recipe_name(recipe));
+    let earlier_run = arguments.part.as_ref().and_then(|part| accepted_run(&arguments.runs, part));
+    if let Some(accepted) = earlier_run.filter(|_| !arguments.json) {
+        super::print(&format!("note     the part {part} was ACCEPTED before, in {}\n", accepted.display()))?;
+    }
     let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.is_marked_simulation());
     let (free, needed) = (free_bytes(&folder).unwrap_or(u64::MAX), task.cycle_bytes());
     if free < needed {

@@ -6,4 +6,5 @@ regrind_testcell::program!();
 #[cfg(unix)]
 mod book;
 mod commands;
+mod first_day;
 mod recipe;

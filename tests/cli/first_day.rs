@@ -1,0 +1,64 @@
+//! Steps of a first day at the terminal: each says the way on, and none goes on in silence.
+
+use std::fs;
+
+use crate::program::{run, run_folders, small_recipe};
+
+#[test]
+fn folder_for_machines_of_people_can_be_planned() {
+    let home = tempfile::tempdir().unwrap();
+    let (code, said, errors) = run(&["init", "shop", "--machines", "manual"], home.path());
+    assert_eq!(code, 0, "{said}{errors}");
+    let (code, said, errors) = run(&["plan", "recipe.toml", "--cell", "cell.toml"], &home.path().join("shop"));
+    assert!(code == 0 && said.contains("cycles"), "{said}{errors}");
+}
+
+#[test]
+fn folder_of_other_part_keeps_nothing_of_the_example() {
+    let home = tempfile::tempdir().unwrap();
+    let (code, said, _) = run(&["init", "lens", "--part", "Linse Ø40"], home.path());
+    assert!(code == 0 && said.contains("the surface in recipe.toml is still that of the example"), "{said}");
+    let recipe = fs::read_to_string(home.path().join("lens/recipe.toml")).unwrap();
+    assert!(recipe.contains("name = \"Linse Ø40\"") && recipe.contains("# The surface of the example"), "{recipe}");
+    assert!(!recipe.contains("FFM-102-062") && !recipe.contains("fused silica"), "{recipe}");
+    assert_eq!(run(&["check", "lens/recipe.toml"], home.path()).0, 0);
+    let (_, said, _) = run(&["init", "example"], home.path());
+    assert!(!said.contains("still that of the example"), "{said}");
+}
+
+/// Each mistake is named with the way on, in one line.
+#[test]
+fn mistakes_are_named_with_the_way_on() {
+    let home = tempfile::tempdir().unwrap();
+    assert_eq!(run(&["init", "shop"], home.path()).0, 0);
+    let rows: String = (0..300).map(|k| format!("{k},{k},{k}\n")).collect();
+    fs::write(home.path().join("points.csv"), format!("# mm\n{rows}")).unwrap();
+    for (arguments, words) in [
+        (&["doctor", "shop/recipe.toml"][..], "regrind doctor --recipe shop/recipe.toml"),
+        (&["audit", "verify", "nope"], "no such folder"),
+        (&["report", "nope"], "no such folder"),
+        (&["serve", "--runs", "nope", "--listen", "127.0.0.1:0"], "mkdir nope"),
+        (&["check", "points.csv"], "regrind accuracy"),
+    ] {
+        let (code, said, errors) = run(arguments, home.path());
+        let all = format!("{said}{errors}");
+        assert!(code == 2 && all.contains(words), "{arguments:?}: {code} {all}");
+        assert!(all.lines().count() <= 2, "{all}");
+    }
+}
+
+/// The place of the report is printed, and a part that was accepted before is not made again without a word.
+#[test]
+fn accepted_part_is_named_when_it_is_made_again() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e5).display().to_string();
+    let make = |serial: &str| run(&["run", &recipe, "--cell", "sim", "--part", serial], home.path());
+    let (code, first, _) = make("SN-1");
+    assert!(code == 0 && !first.contains("ACCEPTED before"), "{first}");
+    let folder = run_folders(&home.path().join("runs")).remove(0);
+    let name = folder.file_name().unwrap().to_str().unwrap();
+    assert!(first.contains(&format!("report   runs/{name}/report.html")), "{first}");
+    let (_, again, _) = make("SN-1");
+    assert!(again.contains(&format!("SN-1 was ACCEPTED before, in runs/{name}")), "{again}");
+    assert!(!make("SN-2").1.contains("ACCEPTED before"));
+}
