@@ -10,7 +10,7 @@ use regrind::journal::{
     Anchor, DATABASE, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Verified, verify_against,
 };
 use regrind::record::{Begin, RunContent, begin_of};
-use regrind::report::{report_language, run_report, words};
+use regrind::report::{report_options, run_report, words};
 use serde_json::json;
 
 use super::Outcome;
@@ -224,10 +224,16 @@ fn is_folder_of_runs(folder: &Path) -> bool {
 /// now. Returns an empty text if there is nothing to report.
 fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     let report = RunFile::Report.name();
+    let text = std::fs::read_to_string(folder.join(report)).unwrap_or_default();
+    // The header of a shop is in the file of the report alone, so anybody can change it.
+    let header = report_options(&text).and_then(|options| options.header).map_or(String::new(), |header| {
+        let name = regrind::document::visible(&header.name);
+        format!("header      of {report}: {name}; its name, address, logo and fields are not in the record, so not verified\n")
+    });
     let edited = unrecorded.iter().any(|name| name == report)
         && std::fs::read_to_string(folder.join(report)).ok().is_none_or(|text| {
-            let language = report_language(&text).unwrap_or_default();
-            run_report(folder, language).ok().as_ref() != Some(&text)
+            let options = report_options(&text).unwrap_or_default();
+            run_report(folder, &options).ok().as_ref() != Some(&text)
         });
     let others: Vec<&str> = unrecorded.iter().map(String::as_str).filter(|name| *name != report).collect();
     let report = if edited {
@@ -237,6 +243,7 @@ fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     } else {
         String::new()
     };
+    let report = format!("{header}{report}");
     match others.len() {
         0 => report,
         _ => format!("{report}files       not in the record, so not verified: {}\n", others.join(", ")),

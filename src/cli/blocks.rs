@@ -49,7 +49,10 @@ impl Blocks {
         if !(wide > 0.0 && deep > 0.0) || most.contains(&0) {
             return None;
         }
-        let pixel_mm = (wide / most[0] as f64).max(deep / (2 * most[1]) as f64);
+        // A pixel is at least as large as the distance of the nodes, so that none between them is empty.
+        let spacing_mm =
+            [0, 1].map(|k| spacing(nodes.iter().map(|node| node[k]).collect())).into_iter().fold(0.0, f64::max);
+        let pixel_mm = (wide / most[0] as f64).max(deep / (2 * most[1]) as f64).max(spacing_mm);
         let [columns, lines] = [wide, deep].map(|size| ((size / pixel_mm).round() as usize).max(1));
         let mut sums = vec![(0.0, 0_u32); columns * lines];
         for [x, y, value_mm] in nodes {
@@ -89,6 +92,16 @@ impl Blocks {
     }
 }
 
+/// Returns the smallest distance of two different coordinates, or 0 if there are no two.
+fn spacing(mut coordinates: Vec<f64>) -> f64 {
+    coordinates.sort_by(f64::total_cmp);
+    let (Some(first), Some(last)) = (coordinates.first(), coordinates.last()) else { return 0.0 };
+    // The nodes of one column are written alike; a smaller distance is a rounding error.
+    let least = 1e-6 * (last - first);
+    let steps = coordinates.windows(2).map(|pair| pair[1] - pair[0]).filter(|step| *step > least);
+    steps.fold(None, |smallest: Option<f64>, step| Some(smallest.map_or(step, |of| of.min(step)))).unwrap_or(0.0)
+}
+
 /// Returns `values` as a line of bars, with one character for each value. The height of a bar is on a logarithmic scale
 /// from the minimum (lowest bar) to the maximum (highest bar). A value below 1e-9 counts as 1e-9. If all values are
 /// equal, all bars have the full height.
@@ -122,6 +135,21 @@ mod tests {
         let both = blocks.append_right(sigma, 2);
         assert!(both.rows.iter().all(|row| row.len() == 42 && row[20..22] == [[None; 2]; 2]));
         assert_eq!(both.rows[0][30][0].unwrap(), ColourMap::Sequential.at(1.0));
+    }
+
+    /// A terminal wider than the map has nodes: every pixel between the nodes has a colour.
+    #[test]
+    fn blocks_have_no_empty_pixels_at_any_width() {
+        let nodes: Vec<MapNode> =
+            (0..40).flat_map(|i| (0..20).map(move |j| node([f64::from(i), f64::from(j)], 1e-3))).collect();
+        for wide in [10, 39, 40, 60, 120, 200] {
+            let blocks = Blocks::paint_error(&nodes, [wide, 100]).unwrap();
+            let lines = blocks.rows.len();
+            let is_full = |(line, row): (usize, &Vec<[Pixel; 2]>)| {
+                row.iter().all(|[above, below]| above.is_some() && (below.is_some() || line + 1 == lines))
+            };
+            assert!(blocks.rows.iter().enumerate().all(is_full), "{wide}");
+        }
     }
 
     /// Returns a node with a standard deviation of 0.1 µm.

@@ -101,7 +101,9 @@ pub(super) enum Failure {
     NotToCheck { path: PathBuf },
     #[error("{}: this is a recipe, and `regrind doctor` checks a cell; write: regrind doctor --recipe {0}", .path.display())]
     RecipeForCell { path: PathBuf },
-    #[error("{}: there is no such folder; `regrind runs` lists the runs", .path.display())]
+    #[error("{}: this header of a report cannot be used: {reason}; `regrind report --help` shows its keys", .path.display())]
+    ShopHeader { path: PathBuf, reason: String },
+    #[error("{}: there is no such folder; give the folder of a run; `regrind runs` lists them", .path.display())]
     NoSuchFolder { path: PathBuf },
     #[error("{path}: this run is not active ({source}); to see how the run ended: `regrind audit show`")]
     NotRunning { path: PathBuf, source: io::Error },

@@ -95,7 +95,7 @@ impl RunContext<'_> {
         let ending = go(run, machines, actor).await?;
         let shown = showing.await.map_err(|e| Failure::Terminal(e.into()));
         // The record is closed. A failed report or a closed terminal must not change the result of the run.
-        let report = regrind::report::write_run_report(self.folder, regrind::report::Language::En);
+        let report = regrind::report::write_run_report(self.folder, &regrind::report::ReportOptions::default());
         shown??;
         match report {
             Err(error) => super::print(&format!("the report was not written: {error}\n"))?,

@@ -1,9 +1,12 @@
 //! `regrind report`: one HTML file about a run, and its results in formats of other systems.
 
-use std::path::PathBuf;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
-use regrind::report::{Language, ResultsFormat, write_run_report, write_run_results};
+use regrind::report::{
+    Language, MAX_LOGO_BYTES, ReportOptions, ResultsFormat, ShopHeader, logo_uri, write_run_report, write_run_results,
+};
 
 use super::Outcome;
 use super::control::folder_of;
@@ -15,9 +18,18 @@ use super::failure::Failure;
 RUN is the folder of a run; by default the newest under runs/. The record is verified first. The report is
 RUN/report.html. Results for other systems have each measurement with its figures, limits, uncertainties and verdict.
 
+A header file has these keys; only `name` is required, and the path of the logo is relative to the file:
+
+  name = \"Optics Ltd\"
+  address = [\"1 Lens Lane\", \"Jena\"]
+  logo = \"logo.svg\"
+  [[fields]]
+  name = \"Order\"
+  text = \"4711\"
+
 Examples:
   regrind report runs/freeform-mirror-20260704T120000Z
-  regrind report runs/freeform-mirror-20260704T120000Z --language de
+  regrind report runs/freeform-mirror-20260704T120000Z --language de --header shop.toml
   regrind report runs/freeform-mirror-20260704T120000Z --qif --dfq=/srv/qdas/part-17.dfq
 
 Exit codes: 0 written; 1 the record is broken; 2 no such run, no record in it, nothing measured (with --qif or --dfq), or a file
@@ -35,9 +47,35 @@ pub(super) struct Arguments {
     /// Language of the report: en, de or zh. Sentences of the record stay in its words
     #[arg(long, value_name = "LANGUAGE", default_value = "en", value_parser = language)]
     language: Language,
+    /// TOML file with the header of the shop: name, address, logo and fields
+    #[arg(long, value_name = "FILE")]
+    header: Option<PathBuf>,
     /// Print JSON instead of text
     #[arg(long)]
     json: bool,
+}
+
+/// Reads the header of a shop, with the picture of its logo.
+fn shop_header(path: &Path) -> Result<ShopHeader, Failure> {
+    let wrong = |reason: String| Failure::ShopHeader { path: path.to_owned(), reason };
+    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+    let mut header: ShopHeader = toml::from_str(&text).map_err(|error| wrong(error.to_string()))?;
+    if let Some(logo) = &header.logo {
+        let logo = path.parent().unwrap_or(Path::new("")).join(logo);
+        let picture = std::fs::File::open(&logo).and_then(|file| {
+            let mut bytes = Vec::new();
+            // One byte more than is allowed shows that a file is too large.
+            file.take(MAX_LOGO_BYTES as u64 + 1).read_to_end(&mut bytes)?;
+            Ok(bytes)
+        });
+        let picture = picture.map_err(|error| wrong(format!("the logo {}: {error}", logo.display())))?;
+        let uri = logo_uri(&picture);
+        header.logo = Some(uri.ok_or_else(|| {
+            wrong(format!("the logo {} is no PNG, JPEG or SVG of at most {} KiB", logo.display(), MAX_LOGO_BYTES >> 10))
+        })?);
+    }
+    header.check().map_err(wrong)?;
+    Ok(header)
 }
 
 /// Reads the tag of a language of the report.
@@ -49,7 +87,9 @@ fn language(text: &str) -> Result<Language, String> {
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let folder = folder_of(arguments.run.as_deref())?;
-    let mut written = vec![("report", write_run_report(&folder, arguments.language).map_err(Failure::Report)?)];
+    let header = arguments.header.as_deref().map(shop_header).transpose()?;
+    let options = ReportOptions { language: arguments.language, header };
+    let mut written = vec![("report", write_run_report(&folder, &options).map_err(Failure::Report)?)];
     let wanted = [("qif", ResultsFormat::Qif, &arguments.qif), ("dfq", ResultsFormat::Dfq, &arguments.dfq)];
     for (key, format, path) in wanted {
         if let Some(path) = path {

@@ -1,7 +1,7 @@
 //! Plans of runs for the page: the points of the CMM, the path of the wheel, and the equipment.
 
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use regrind::compensation::path::{Move, ToolPath};
 use regrind::config::CellConfig;
@@ -16,66 +16,74 @@ const BEND_RAD: f64 = 0.02;
 /// Maximum number of points of the picture of a path.
 const MAX_PATH_POINTS: usize = 40_000;
 
-/// Plan of one run.
-#[derive(Clone)]
+/// Number of runs whose plans are kept.
+const KEPT_PLANS: usize = 4;
+
+/// Points of the CMM and path of the wheel of one run.
 struct Planned {
     points: Vec<[f64; 2]>,
     path: Option<Vec<[f64; 3]>>,
-    equipment: Equipment,
 }
 
-/// Plans of runs, computed again from the files in their folders. The last one is kept.
+/// Plans of runs, computed again from the files in their folders. The last ones are kept, also those that cannot be
+/// computed.
 #[derive(Default)]
-pub(super) struct RunPlans(Mutex<Option<(PathBuf, Planned)>>);
+pub(super) struct RunPlans(Mutex<Vec<(PathBuf, Option<Arc<Planned>>)>>);
 
 impl RunPlans {
-    fn of_run<T>(&self, run: &Path, part: impl Fn(&Planned) -> T) -> Option<T> {
-        let mut last = self.0.lock().ok()?;
-        if let Some((known, planned)) = &*last
-            && known == run
-        {
-            return Some(part(planned));
+    /// Returns the plan of a run. Other runs are not kept waiting while it is computed.
+    fn of_run(&self, run: &Path) -> Option<Arc<Planned>> {
+        let kept = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, planned)) = kept().iter().find(|(known, _)| known == run) {
+            return planned.clone();
         }
-        let planned = plan(run)?;
-        let found = part(&planned);
-        *last = Some((run.to_owned(), planned));
-        Some(found)
+        let planned = plan(run).map(Arc::new);
+        let mut plans = kept();
+        plans.insert(0, (run.to_owned(), planned.clone()));
+        plans.truncate(KEPT_PLANS);
+        planned
     }
 }
 
 impl RunPlan for RunPlans {
     fn points(&self, folder: &Path) -> Option<Vec<[f64; 2]>> {
-        self.of_run(folder, |planned| planned.points.clone())
+        Some(self.of_run(folder)?.points.clone())
     }
 
     fn path(&self, folder: &Path) -> Option<Vec<[f64; 3]>> {
-        self.of_run(folder, |planned| planned.path.clone())?
+        self.of_run(folder)?.path.clone()
     }
 
     fn equipment(&self, folder: &Path) -> Option<Equipment> {
-        self.of_run(folder, |planned| planned.equipment.clone())
+        let (recipe, cell) = recipe_and_cell(folder)?;
+        Some(Equipment {
+            calibration_due: [&cell.cmm.link, &cell.grinder.link].map(|link| link.calibration_due.clone()),
+            probe_radius_mm: recipe.measure.probe_radius_mm,
+            radius_tolerance_um: recipe.measure.qualify.then_some(recipe.measure.radius_tolerance_um.0),
+            wheel_radius_mm: wheel_radius_mm(&recipe.grinding.wheel),
+        })
     }
 }
 
-/// Plans the run in the folder `run` again, from the recipe and the cell file in this folder. Returns `None` if the
-/// recipe, the cell file or the first record is missing or invalid.
-fn plan(run: &Path) -> Option<Planned> {
+/// Reads the recipe and the cell file in the folder `run`. Returns `None` if one of them or the first record is missing
+/// or invalid.
+fn recipe_and_cell(run: &Path) -> Option<(Recipe, CellConfig)> {
     let begin = begin_of(run).ok()?;
     let start = begin.content.part()?;
     let from = PathBuf::from(start.working_folder.as_ref()?);
     let text = |file: RunFile| std::fs::read_to_string(run.join(file.name())).ok();
     let recipe = Recipe::parse(&from.join(start.recipe.as_ref()?), &text(RunFile::Recipe)?).ok()?;
     let cell = CellConfig::parse(&from.join(start.cell.as_ref()?), &text(RunFile::Cell)?).ok()?;
+    Some((recipe, cell))
+}
+
+/// Plans the run in the folder `run` again. Returns `None` if its files are missing or invalid.
+fn plan(run: &Path) -> Option<Planned> {
+    let (recipe, cell) = recipe_and_cell(run)?;
     let (task, _) = setup::prepare(&recipe, &cell).ok()?;
     let path = task.first_path().ok().flatten().map(|(path, _)| picture(&path));
-    let equipment = Equipment {
-        calibration_due: [&cell.cmm.link, &cell.grinder.link].map(|link| link.calibration_due.clone()),
-        probe_radius_mm: recipe.measure.probe_radius_mm,
-        radius_tolerance_um: recipe.measure.qualify.then_some(recipe.measure.radius_tolerance_um.0),
-        wheel_radius_mm: wheel_radius_mm(&recipe.grinding.wheel),
-    };
     let points = task.targets.iter().map(|target| [target.point.x, target.point.y]).collect();
-    Some(Planned { points, path, equipment })
+    Some(Planned { points, path })
 }
 
 /// Returns the radius of a wheel that is a ball; `None` for other shapes.

@@ -90,11 +90,11 @@ impl PageAccess {
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let Arguments { runs, listen, door, while_stdin, first_run } = arguments;
-    if !runs.is_dir() {
-        return Err(Failure::NoRunsFolder { path: runs.clone() });
-    }
     super::runtime()?.block_on(async {
         let (listener, entrance) = door.open(*listen).await?;
+        if !runs.is_dir() {
+            return Err(Failure::NoRunsFolder { path: runs.clone() });
+        }
         let taken = |source| Failure::Page { address: *listen, source };
         let page = Page::new(
             std::path::absolute(runs).unwrap_or_else(|_| runs.clone()),

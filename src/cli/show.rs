@@ -204,7 +204,8 @@ impl Show {
             self.line(&format!("cycle {cycle}: {known}{points} points measured; {targets} more follow: {reason}"))?;
             return self.picture(cycle);
         }
-        let mut text = format!("cycle {cycle}: {pv}; {rms}; {points} points, {outliers} outliers");
+        // The judgement follows, with the figures and their limits.
+        let mut text = format!("cycle {cycle}: {points} points, {outliers} outliers");
         for words in figures.weak_directions.iter().chain(&figures.warnings) {
             let _ = write!(text, "\n         {words}");
         }

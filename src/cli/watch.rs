@@ -59,7 +59,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             map: None,
             as_sigma: false,
             looked: None,
-            said: String::new(),
+            said: (String::new(), 0),
         };
         let mut terminal = ratatui::init();
         let ended = view.follow(&mut terminal, &mut watch).await;
@@ -117,8 +117,9 @@ struct View {
     as_sigma: bool,
     /// Time of the last check of the record for a newer map, and the number of the cell's state at that time.
     looked: Option<(Instant, u64)>,
-    /// Message about the result of the last key.
-    said: String,
+    /// Message about the result of the last key, with the number of the cell's state at that time. In another state it
+    /// is no news.
+    said: (String, u64),
 }
 
 impl View {
@@ -154,11 +155,12 @@ impl View {
         let asked = tokio::task::spawn_blocking(move || {
             send_request(&folder, &Request::Hold { reason: "regrind watch".into(), state_number: None })
         });
-        self.said = match asked.await {
+        let message = match asked.await {
             Ok(Ok(reply)) => format!("hold: {}", reply.message),
             Ok(Err(error)) => format!("hold: {error}"),
             Err(error) => format!("hold: {error}"),
         };
+        self.said = (message, self.snapshot.state_number);
     }
 
     /// Reads the newest error map in the record of the run and stores it for display. Does nothing if the status of the
@@ -203,7 +205,10 @@ impl View {
         let (figures, map) = if wide { (right, left) } else { (left, right) };
         frame.render_widget(self.figures(), figures);
         self.map(frame, map);
-        let keys = if self.said.is_empty() { "h hold   u uncertainty   q quit" } else { &self.said };
+        let (message, of_state) = &self.said;
+        // The hold itself brings the cell through Holding to Held.
+        let is_news = !message.is_empty() && self.snapshot.state_number <= of_state + 2;
+        let keys = if is_news { message } else { "h hold   u uncertainty   q quit" };
         frame.render_widget(Paragraph::new(keys).dim(), foot);
     }
 
@@ -231,15 +236,15 @@ impl View {
         let Some(JobProgress { device, done, total, remaining_s }) = self.snapshot.progress else { return };
         let left = remaining_s.map_or(String::new(), |remaining_s| format!(", {} left", time_left(remaining_s)));
         let ratio = (f64::from(done) / f64::from(total.max(1))).clamp(0.0, 1.0);
-        let gauge = Gauge::default()
-            .ratio(ratio)
-            .gauge_style(Color::Blue)
-            .label(format!("{}{left}", how_far(device, done, total)));
-        let [bar, below] = Layout::vertical([Constraint::Length(1), Constraint::Min(0)]).areas(area);
+        // A text on the bar could not be read on both of its colours.
+        let gauge =
+            Gauge::default().ratio(ratio).gauge_style(Style::new().fg(Color::Blue).bg(Color::DarkGray)).label("");
+        let [text, bar] = Layout::vertical([Constraint::Length(1), Constraint::Length(1)]).areas(area);
+        let preview = self.snapshot.preview.as_ref().map_or(String::new(), |told| format!("   {}", preview_text(told)));
+        let line =
+            Line::from(vec![Span::raw(format!("{}{left}", how_far(device, done, total))), Span::raw(preview).dim()]);
+        frame.render_widget(Paragraph::new(line), text);
         frame.render_widget(gauge, bar);
-        if let Some(told) = &self.snapshot.preview {
-            frame.render_widget(Paragraph::new(preview_text(told)).dim(), below);
-        }
     }
 
     fn alarms(&self) -> Text<'_> {

@@ -73,6 +73,16 @@ struct Observed {
 }
 
 impl Observed {
+    /// Removes the signals that are not among `names`: some are reported only while they are impossible.
+    fn forget_other_signals(&mut self, names: &[&str]) {
+        let is_kept = |value: &MachineValue| value.kind != ValueKind::Signal || names.contains(&value.name.as_str());
+        let kept: Vec<bool> = self.status.values.iter().map(is_kept).collect();
+        let mut keeps = kept.iter();
+        self.status.values.retain(|_| keeps.next() == Some(&true));
+        let mut keeps = kept.iter();
+        self.trends.retain(|_| keeps.next() == Some(&true));
+    }
+
     fn add(&mut self, kind: ValueKind, (name, unit): (&str, &str), range: Option<[f64; 2]>, value: Option<f64>) {
         let now = Instant::now();
         let values = &mut self.status.values;
@@ -82,7 +92,7 @@ impl Observed {
             self.trends.push(Trend::new(now));
             values.len() - 1
         });
-        values[at].value = value;
+        (values[at].value, values[at].range) = (value, range);
         value.into_iter().for_each(|value| self.trends[at].add(now, value));
     }
 }
@@ -123,8 +133,12 @@ impl MachineMonitor {
         (shown.state, shown.is_connected) = (Some(status.state.to_string()), true);
         (shown.is_automatic, shown.is_clear, shown.has_supplies) =
             (status.automatic, status.clear_of_part, status.supplies);
+        // A value that this status does not have is unknown now. A signal that it does not have is no longer shown.
+        let names: Vec<&str> = status.signals.iter().map(|signal| signal.name.as_str()).collect();
+        observed.forget_other_signals(&names);
         observed.add(ValueKind::AnswerTime, ("", "ms"), None, Some(1e3 * answer_time.as_secs_f64()));
-        if status.temperature_c.is_some() {
+        let is_known = observed.status.values.iter().any(|value| value.kind == ValueKind::Temperature);
+        if status.temperature_c.is_some() || is_known {
             observed.add(ValueKind::Temperature, ("", "\u{b0}C"), None, status.temperature_c);
         }
         for signal in &status.signals {
@@ -205,6 +219,12 @@ mod tests {
         let [answer, temperature, signal] = &seen.values[..] else { panic!("{seen:?}") };
         assert_eq!(answer.samples, [[8.0, 4.0, 4.0], [5.0, 2.0, 2.0]]);
         assert_eq!((temperature.value, temperature.kind), (Some(20.5), ValueKind::Temperature));
+        // An impossible temperature is none: it is unknown, and no longer the last good one. A signal that is gone is not
+        // shown.
+        let later = Status { temperature_c: None, signals: Vec::new(), ..status(None) };
+        monitor.add_status("cmm at a", &later, Duration::from_millis(1));
+        let later = monitor.status();
+        assert_eq!(later.values.iter().map(|value| value.value).collect::<Vec<_>>(), [Some(1.0), None]);
         // A missing value is unknown, and its course has no sample for it.
         assert_eq!(
             (signal.value, signal.range, &signal.samples[..]),

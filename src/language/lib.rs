@@ -171,6 +171,11 @@ pub fn decimal(value: f64, digits: usize, language: Language) -> String {
     format!("{value:.digits$}").replacen('.', &language.catalogue().decimal_sign, 1).replacen('-', "\u{2212}", 1)
 }
 
+/// Returns the text of a number that has a decimal point with the decimal sign of `language`.
+pub fn localised(number: &str, language: Language) -> String {
+    number.replacen('.', &language.catalogue().decimal_sign, 1)
+}
+
 /// Formats a number with all its decimals, and with the decimal sign of `language`.
 pub fn shortest(value: f64, language: Language) -> String {
     value.to_string().replacen('.', &language.catalogue().decimal_sign, 1)
@@ -221,6 +226,7 @@ mod tests {
     #[test]
     fn numbers_have_sign_of_language() {
         assert_eq!([decimal(1.25, 1, Language::De), decimal(-0.5, 2, Language::En)], ["1,2", "\u{2212}0.50"]);
+        assert_eq!([localised("> 99.9 %", Language::De), localised("7", Language::De)], ["> 99,9 %", "7"]);
         assert_eq!([shortest(1e-3, Language::De), shortest(12.0, Language::De)], ["0,001", "12"]);
     }
 }

@@ -26,7 +26,11 @@ pub(crate) fn gauge(
                 "± " (um(expanded_um)) " µm"
                 @if let Some(limit_um) = limit_um { " · " (Text::Limit.to(language)) " " (um(limit_um)) }
             }
-            (PreEscaped(interval_bar([value_um - expanded_um, value_um, value_um + expanded_um], limit_um)))
+            (PreEscaped(interval_bar(
+                [value_um - expanded_um, value_um, value_um + expanded_um],
+                limit_um,
+                limit_um.is_none_or(|limit_um| value_um + expanded_um <= limit_um),
+            )))
         }
     }
 }

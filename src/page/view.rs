@@ -12,7 +12,7 @@ use regrind_cell::{Device, StateName};
 use regrind_control::{NextStep, Snapshot};
 use regrind_formats::operator_step::StepConfirmation;
 use regrind_formats::run_files::RunFile;
-use regrind_report::{ColourMap, RunResult, report_language};
+use regrind_report::{ColourMap, ReportOptions, RunResult, report_options};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::task::spawn_blocking;
@@ -433,10 +433,14 @@ pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, h
     let language = language(&headers);
     let read = spawn_blocking(move || {
         let file = std::fs::read(folder.join(RunFile::Report.name())).ok();
-        let is_wanted = |html: &Vec<u8>| report_language(&String::from_utf8_lossy(html)) == Some(language);
-        match file.filter(is_wanted) {
+        let options = file.as_ref().and_then(|html| report_options(&String::from_utf8_lossy(html))).unwrap_or_default();
+        let is_wanted = options.language == language;
+        match file.filter(|_| is_wanted) {
             Some(html) => Ok(html),
-            None => regrind_report::run_report(&folder, language).map(String::into_bytes),
+            None => {
+                let options = ReportOptions { language, ..options };
+                regrind_report::run_report(&folder, &options).map(String::into_bytes)
+            }
         }
     });
     match read.await {

@@ -238,7 +238,7 @@ impl Chart {
         let description = if self.description.is_empty() { &self.title } else { &self.description };
         out.put(format_args!(
             "<svg {attributes} viewBox=\"0 0 {width:.0} {height:.0}\" role=\"img\" aria-label=\"{}\">\n{before}",
-            escaped(description)
+            attribute(description)
         ));
         let area = self.area();
         if !self.title.is_empty() {
@@ -247,7 +247,7 @@ impl Chart {
         self.draw_axes(&area, &mut out);
         self.draw_names(&area, &mut out);
         for layer in &self.layers {
-            out.put(format_args!("<g class=\"layer {}\">\n", escaped(&layer.class)));
+            out.put(format_args!("<g class=\"layer {}\">\n", attribute(&layer.class)));
             layer.marks.iter().for_each(|mark| draw_mark(mark, &area, &mut out));
             out.put(format_args!("</g>\n"));
         }
@@ -295,7 +295,7 @@ impl Chart {
         if self.has_legend {
             for (row, layer) in self.layers.iter().filter(|layer| !layer.name.is_empty()).enumerate() {
                 let y = area.top + 10.0 + 20.0 * row as f64;
-                out.put(format_args!("<g class=\"layer {}\">\n", escaped(&layer.class)));
+                out.put(format_args!("<g class=\"layer {}\">\n", attribute(&layer.class)));
                 let is_dashed = layer.marks.iter().any(|mark| matches!(mark, Mark::Dashes(_)));
                 out.line(if is_dashed { "dashes" } else { "line" }, [right + 12.0, y], [right + 36.0, y]);
                 if let Some(Mark::Dot(dot)) = layer.marks.iter().find(|mark| matches!(mark, Mark::Dot(_))) {
@@ -315,11 +315,16 @@ impl Chart {
             .collect();
         let places = apart(named.iter().map(|(.., y)| *y).collect());
         for ((layer, class, name, _), y) in named.into_iter().zip(places) {
-            out.put(format_args!("<g class=\"layer {}\">\n", escaped(layer)));
+            out.put(format_args!("<g class=\"layer {}\">\n", attribute(layer)));
             out.text(&format!("name of-{class}"), [right + 6.0, y + 4.0], "start", name);
             out.put(format_args!("</g>\n"));
         }
     }
+}
+
+/// Escapes a text for an attribute between quotation marks.
+fn attribute(text: &str) -> String {
+    escaped(text).replace('"', "&quot;")
 }
 
 /// Moves labels upwards until they do not overlap. `at` contains the y coordinate of each label in pixels, measured
@@ -373,7 +378,7 @@ fn draw_mark(mark: &Mark, area: &Area, out: &mut Output) {
         }
         Mark::Dot(dot) => {
             if !dot.link.is_empty() {
-                out.put(format_args!("<a href=\"{}\">", escaped(&dot.link)));
+                out.put(format_args!("<a href=\"{}\">", attribute(&dot.link)));
             }
             out.shape(dot.shape, area.place(dot.at), &dot.tooltip);
             if !dot.link.is_empty() {
@@ -470,7 +475,7 @@ mod tests {
 
     fn chart(layers: Vec<Layer>) -> Chart {
         Chart {
-            description: "a <b>".into(),
+            description: "a <b> \"c\"".into(),
             size: [160.0, 96.0],
             right_margin: 8.0,
             x: ChartAxis::of_integers("", [1, 3], 10),
@@ -499,7 +504,7 @@ mod tests {
             "class=\"limit\" x1=\"52.0\" y1=\"27.0\" x2=\"152.0\" y2=\"27.0\"",
             "cx=\"102.0\" cy=\"42.0\" r=\"4\"><title>3 &amp; more</title>",
             "fill=\"#ff0001\" x=\"52.0\" y=\"42.0\" width=\"50.0\" height=\"30.0\"",
-            "aria-label=\"a &lt;b&gt;\"",
+            "aria-label=\"a &lt;b&gt; &quot;c&quot;\"",
         ] {
             assert!(svg.contains(piece), "{piece}: {svg}");
         }

@@ -47,13 +47,20 @@ pub(super) fn convergence(story: &RunHistory, language: Language) -> Option<Stri
         Layer { name: found[k].name.to_owned(), class: ["pv", "rms"][k].to_owned(), marks }
     };
     let number = |value: f64, decimals: usize| decimal(value, decimals, language);
+    let layers = vec![layer(0), layer(1)];
+    let names = layers.iter().flat_map(|layer| &layer.marks).filter_map(|mark| match mark {
+        Mark::Across { name, .. } => Some(name.chars().count()),
+        _ => None,
+    });
+    // Letters of the widest usual fonts take 7.6 pixels.
+    let right_margin = 14.0 + 7.6 * names.max().unwrap_or(0) as f64;
     let chart = Chart {
         title: Text::Convergence.to(language).to_owned(),
         size: [400.0, 180.0],
-        right_margin: 155.0,
+        right_margin,
         x: ChartAxis::of_integers(Text::Cycle.to(language), [*first, *last], 12),
         y: ChartAxis::new("\u{b5}m", Scale::Log, [low / 1.6, 1.2 * high], 9, &number),
-        layers: vec![layer(0), layer(1)],
+        layers,
         ..Chart::default()
     };
     Some(chart.to_markup())

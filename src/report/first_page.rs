@@ -9,11 +9,12 @@ use super::ReportError;
 use super::interval_bar::interval_bar;
 use super::report_content::{Report, when};
 use super::run_history::{Measurement, PassHistory, RunHistory};
+use super::shop_header::ShopHeader;
 use super::texts::{self, ReportText as Text};
 use super::words::{ending_words, home_words};
 use regrind_cell::{ComparedFigure, Conformity, Device, Ending, Figures, JobResult, Tolerance};
 use regrind_formats::escaped;
-use regrind_language::decimal;
+use regrind_language::{decimal, localised};
 
 /// Returns the first page as HTML. `registration` is the content of the newest file `registration.json`, if there is one.
 ///
@@ -21,6 +22,7 @@ use regrind_language::decimal;
 /// Fails if a map cannot be drawn because of a file.
 pub(super) fn first_page(report: &Report, registration: Option<&Value>) -> Result<String, ReportError> {
     let mut html = String::from("<article class=\"first\">\n");
+    html += &report.header.map_or(String::new(), ShopHeader::html);
     html += &head(report);
     html += &broken_off_pass(report.story);
     html += &judged(report);
@@ -60,7 +62,7 @@ fn head(report: &Report) -> String {
          <div class=\"verdict {class}\"><strong>{}</strong></div>\n</div>\n<p class=\"{}\">{}</p>\n{more}",
         escaped(name.unwrap_or("Part")),
         identity.join(" \u{b7} "),
-        when(at),
+        escaped(&when(at)),
         report.say(verdict),
         if is_good { "good" } else { "bad" },
         escaped(&words)
@@ -140,9 +142,9 @@ fn judged_row(report: &Report, compared: &ComparedFigure, tolerance: &Tolerance)
         *compared;
     let um = |mm: f64| um(report, mm);
     let limit = if limit_mm.is_finite() { um(limit_mm) } else { report.say(Text::NoLimit).to_owned() };
-    let bar = interval_bar([low_mm, found_mm, high_mm], Some(limit_mm));
+    let bar = interval_bar([low_mm, found_mm, high_mm], Some(limit_mm), compared.conformity == Conformity::Within);
     let within = compared.probability_in_words().unwrap_or_default();
-    let within = escaped(within.strip_prefix("P(in tolerance) ").unwrap_or(&within));
+    let within = escaped(&localised(within.strip_prefix("P(in tolerance) ").unwrap_or(&within), report.language));
     format!(
         "<tr><td class=\"t\">{name}</td><td class=\"n big\">{}</td><td class=\"n\">\u{b1} {}</td><td class=\"n\">{} \u{2026} {}</td>\
          <td class=\"n\">{limit}</td><td>{bar}</td><td class=\"n\">{within}</td><td>{}</td></tr>\n",
@@ -211,11 +213,11 @@ fn maps(report: &Report) -> Result<String, ReportError> {
     for (limit_um, text) in scales {
         let Some(limit_um) = limit_um else { continue };
         let cycle = report.say(Text::Cycle);
-        let caption = format!("{} {}, {}.", capitalized(cycle), last.cycle, report.say(text));
+        let caption = format!("{} {}, {}.{}", capitalized(cycle), last.cycle, report.say(text), report.mark());
         let _ = writeln!(
             html,
             "<figure class=\"map\">{}<figcaption>{caption}</figcaption></figure>",
-            last.picture(limit_um)?
+            last.picture(limit_um, report.language)?
         );
     }
     let [sign, filtered] = [Text::SignOfMap, Text::MapsFiltered].map(|text| report.say(text));
@@ -231,14 +233,15 @@ fn how_it_got_there(report: &Report) -> Result<String, ReportError> {
     let picture = match &report.maps[..] {
         [first, _] => {
             let caption = format!(
-                "{} {}, {}.",
+                "{} {}, {}.{}",
                 capitalized(report.say(Text::Cycle)),
                 first.cycle,
-                report.say(Text::ScaleOfFirst)
+                report.say(Text::ScaleOfFirst),
+                report.mark()
             );
             format!(
                 "<figure class=\"map\">{}<figcaption>{caption}</figcaption></figure>\n",
-                first.picture(first.own_limit_um())?
+                first.picture(first.own_limit_um(), report.language)?
             )
         }
         _ => String::new(),
@@ -264,12 +267,19 @@ fn how_it_got_there(report: &Report) -> Result<String, ReportError> {
         )
     });
     Ok(format!(
-        "<h2>{}</h2>\n<div class=\"two\">\n{picture}<div><table id=\"progress\">\n<thead><tr><th class=\"n\">{}</th><th class=\"n\">PV, \u{b5}m</th>\
+        "<h2>{}</h2>\n<div class=\"two\">\n{picture}<div><table id=\"progress\">\n<thead><tr><th class=\"n\">{}</th><th class=\"n\">{}, \u{b5}m</th>\
          <th class=\"n\">RMS, \u{b5}m</th><th>{}</th></tr></thead>\n{rows}{limits}</table></div>\n</div>\n",
         report.say(Text::HowItGotThere),
         report.say(Text::Cycle),
+        name_of_pv(report),
         report.say(Text::Decision),
     ))
+}
+
+/// Returns the name of the judged peak-to-valley, such as "PV 99.8 %".
+fn name_of_pv(report: &Report) -> &'static str {
+    let last = report.story.tolerance().zip(report.story.last_measured());
+    last.map_or("PV", |(tolerance, (.., figures))| tolerance.compare(figures)[0].name)
 }
 
 /// Returns PV and RMS with two decimals, as they are compared with the limits.

@@ -12,6 +12,7 @@ use super::axis::three_digits;
 use super::report_content::Report;
 use super::texts::ReportText as Text;
 use regrind_formats::{FormatError, escaped};
+use regrind_language::localised;
 
 /// Returns the HTML section about the form of the surface. Its tables have a row for each figure, such as PV, and a
 /// column for each cycle that has figures. `folder` is the run folder. Returns an empty text if no cycle has figures.
@@ -72,8 +73,12 @@ fn estimated_figures(report: &Report, cycles: &[(u32, Value)], last: &Value) -> 
     );
     for row in list {
         let text = |key: &str| escaped(&with_micro(row[key].as_str().unwrap_or_default()));
-        let cell = |(_, figures): &(u32, Value)| match named(figures, "form", &row["name"]).and_then(interval) {
-            Some([median, low, high]) => format!("<td class=\"n\">{median}<br/><small>{low} to {high}</small></td>"),
+        let cell = |(_, figures): &(u32, Value)| match named(figures, "form", &row["name"])
+            .and_then(|row| interval(report, row))
+        {
+            Some([median, low, high]) => {
+                format!("<td class=\"n\">{median}<br/><small>{low} \u{2026} {high}</small></td>")
+            }
             None => "<td class=\"n\">-</td>".to_owned(),
         };
         let cells: String = cycles.iter().map(cell).collect();
@@ -81,7 +86,7 @@ fn estimated_figures(report: &Report, cycles: &[(u32, Value)], last: &Value) -> 
             html,
             "<tr><td>{}</td>{cells}<td class=\"n\">{}</td><td>{}</td><td>{}</td></tr>",
             text("name"),
-            in_unit(row, "raw").unwrap_or_else(|| "-".to_owned()),
+            in_unit(report, row, "raw").unwrap_or_else(|| "-".to_owned()),
             unit(row),
             text("made")
         );
@@ -92,14 +97,14 @@ fn estimated_figures(report: &Report, cycles: &[(u32, Value)], last: &Value) -> 
 
 /// Returns three texts from a row of `figures.json`: the median of a figure, and the lower and upper end of its
 /// credible interval. Returns `None` if one of the three is missing.
-fn interval(row: &Value) -> Option<[String; 3]> {
-    Some([in_unit(row, "median")?, in_unit(row, "low")?, in_unit(row, "high")?])
+fn interval(report: &Report, row: &Value) -> Option<[String; 3]> {
+    Some([in_unit(report, row, "median")?, in_unit(report, row, "low")?, in_unit(report, row, "high")?])
 }
 
 /// Returns a number of a row in the unit that [`unit`] names. Lengths are in micrometres throughout the report.
-fn in_unit(row: &Value, key: &str) -> Option<String> {
+fn in_unit(report: &Report, row: &Value, key: &str) -> Option<String> {
     let scale = if row["unit"] == "nm" { 1e-3 } else { 1.0 };
-    row[key].as_f64().map(|value| three_digits(scale * value))
+    row[key].as_f64().map(|value| localised(&three_digits(scale * value), report.language))
 }
 
 /// Returns the unit of a row.
@@ -135,7 +140,7 @@ fn raw(report: &Report, cycles: &[(u32, Value)], last: &Value) -> String {
     for row in rows {
         let text = |key: &str| with_micro(row[key].as_str().unwrap_or_default());
         let cell = |(_, figures): &(u32, Value)| {
-            let value = named(figures, "figures", &row["name"]).and_then(|row| in_unit(row, "value"));
+            let value = named(figures, "figures", &row["name"]).and_then(|row| in_unit(report, row, "value"));
             format!("<td class=\"n\">{}</td>", value.unwrap_or_else(|| "-".to_owned()))
         };
         let cells: String = cycles.iter().map(cell).collect();

@@ -9,6 +9,7 @@ use regrind_core::geometry::{Aperture, Grid};
 use regrind_core::registration::{Deviation, PointStatus};
 use regrind_figures::statistics::rms;
 use regrind_formats::write_atomic;
+use regrind_language::{Language, localised};
 
 use super::axis::{Ruler, Scale, grouped, three_digits};
 use super::colour::{ColourMap, Tones};
@@ -263,27 +264,31 @@ impl HeatMap {
         let rendering = if pixel > 4.0 { "pixelated" } else { "auto" };
         svg.image(frame.corner, frame.size, &STANDARD.encode(self.to_png()?), rendering);
         svg.frame(&frame);
-        self.colour_bar(&mut svg, [left + width + 18.0, top], height, true);
+        self.colour_bar(&mut svg, [left + width + 18.0, top], height, None);
         Ok(svg.finish())
     }
 
     /// Returns the map for a page that has its title and its figures around it: the map within axes, a colour bar, and
-    /// its lowest and highest sample, each with a cross and its value.
+    /// its lowest and highest sample, each with a cross and its value. Numbers have the decimal sign of `language`.
     ///
     /// # Errors
     /// Fails if the pixels cannot be encoded.
-    pub fn to_plain_svg(&self) -> Result<String, ReportError> {
+    pub fn to_plain_svg(&self, language: Language) -> Result<String, ReportError> {
         let frame = Frame { corner: [44.0, 8.0], x_label: "mm", y_label: "", ..self.frame_at([44.0, 8.0]) };
         let ([left, top], [width, height], rulers) = (frame.corner, frame.size, self.rulers(frame.corner));
         let mut svg = Svg::new(left + width + 74.0, top + height + 44.0);
         svg.image(frame.corner, frame.size, &STANDARD.encode(self.to_png()?), "auto");
         svg.frame(&frame);
-        self.colour_bar(&mut svg, [left + width + 12.0, top], height, false);
+        self.colour_bar(&mut svg, [left + width + 12.0, top], height, Some(language));
         svg.text([left + width + 12.0, top + height + 19.0], Anchor::Start, SMALL, &self.unit);
         for [x, y, value] in self.extremes {
             let at = [rulers[0].pixel(x), rulers[1].pixel(y)];
             let sign = if value < 0.0 { "\u{2212}" } else { "+" };
-            svg.cross(at, &format!("{sign}{}", three_digits(value.abs())), at[0] > left + 0.8 * width);
+            svg.cross(
+                at,
+                &format!("{sign}{}", localised(&three_digits(value.abs()), language)),
+                at[0] > left + 0.8 * width,
+            );
         }
         Ok(svg.finish())
     }
@@ -328,7 +333,7 @@ impl HeatMap {
         Frame { corner, size, x_ticks, y_ticks, x_label: "x / mm", y_label: "y / mm", grid: false }
     }
 
-    fn colour_bar(&self, svg: &mut Svg, [left, top]: [f64; 2], height: f64, has_name: bool) {
+    fn colour_bar(&self, svg: &mut Svg, [left, top]: [f64; 2], height: f64, language: Option<Language>) {
         const BAR: f64 = 16.0;
         svg.gradient(&self.tones.id(), &self.tones.stops());
         svg.rectangle([left, top], [BAR, height], &format!("url(#{})", self.tones.id()));
@@ -337,11 +342,13 @@ impl HeatMap {
             let pixel = ruler.pixel(end);
             svg.line([left - 5.0, pixel], [left + BAR, pixel], super::svg::INK);
         }
-        for tick in ruler.ticks((height / 36.0) as usize) {
+        for mut tick in ruler.ticks((height / 36.0) as usize) {
+            tick.label = language.map_or(tick.label.clone(), |language| localised(&tick.label, language));
             svg.line([left + BAR, tick.pixel], [left + BAR + 4.0, tick.pixel], super::svg::INK);
             svg.tick_label([left + BAR + 8.0, tick.pixel + 4.0], Anchor::Start, &tick);
         }
-        if has_name {
+        // A map on a page has the unit below its bar.
+        if language.is_none() {
             let name = format!("{} / {}", self.quantity, self.unit);
             svg.upright([left + 76.0, top + height / 2.0], &name);
         }

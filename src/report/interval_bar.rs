@@ -7,9 +7,10 @@ const LARGEST_SHARE: f64 = 0.9;
 
 /// Returns the bar of a figure as an SVG element of a page. `interval` has the lower end, the value and the upper end.
 /// The interval and the limit have one unit, and the style sheet of the page gives the colours of the classes `track`,
-/// `value`, `uncertainty`, `limit` and `beyond`. The limit is `beyond` if the interval exceeds it. A number that is not
-/// finite has no mark.
-pub fn interval_bar(interval: [f64; 3], limit: Option<f64>) -> String {
+/// `value`, `uncertainty`, `limit` and `beyond`. A number that is not
+/// finite has no mark. `is_within` is false if the figure does not keep its limit by the rule of its decision; the limit
+/// is then `beyond`.
+pub fn interval_bar(interval: [f64; 3], limit: Option<f64>, is_within: bool) -> String {
     let [low, value, high] = interval;
     let limit = limit.filter(|limit| limit.is_finite());
     let largest = limit.unwrap_or(0.0).max(high).max(value);
@@ -21,7 +22,7 @@ pub fn interval_bar(interval: [f64; 3], limit: Option<f64>) -> String {
     let rect = |class: &str, x: f64, width: f64, [y, height]: [u32; 2]| {
         format!("<rect class=\"{class}\" x=\"{x:.1}\" y=\"{y}\" width=\"{width:.1}\" height=\"{height}\"/>")
     };
-    let class = if limit.is_some_and(|limit| high > limit) { "limit beyond" } else { "limit" };
+    let class = if is_within { "limit" } else { "limit beyond" };
     let mark = limit.map_or(String::new(), |limit| rect(class, place(limit), 3.0, [0, 16]));
     format!(
         "<svg class=\"interval\" viewBox=\"0 0 {WIDTH} 16\" preserveAspectRatio=\"none\" aria-hidden=\"true\">{}{}{}{mark}</svg>",
@@ -38,7 +39,7 @@ mod tests {
     /// The limit of 8 is the largest value: it lies at 0.9 of 400. The figure of 4 ± 1 lies at half of this.
     #[test]
     fn bar_places_value_interval_and_limit() {
-        let svg = interval_bar([3.0, 4.0, 5.0], Some(8.0));
+        let svg = interval_bar([3.0, 4.0, 5.0], Some(8.0), true);
         for piece in [
             "class=\"limit\" x=\"360.0\"",
             "class=\"value\" x=\"0.0\" y=\"3\" width=\"180.0\"",
@@ -47,7 +48,7 @@ mod tests {
             assert!(svg.contains(piece), "{piece}: {svg}");
         }
         assert!(!svg.contains("beyond"), "{svg}");
-        assert!(interval_bar([5.5, 7.0, 8.5], Some(8.0)).contains("limit beyond"));
+        assert!(interval_bar([5.5, 7.0, 8.5], Some(8.0), false).contains("limit beyond"));
         roxmltree::Document::parse(&svg).unwrap();
     }
 
@@ -60,7 +61,7 @@ mod tests {
             ([1.0; 3], Some(f64::INFINITY)),
         ];
         for (interval, limit) in odd {
-            let svg = interval_bar(interval, limit);
+            let svg = interval_bar(interval, limit, true);
             assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
         }
     }

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use super::axis::{Scale, fixed, grouped};
+use super::axis::{Scale, fixed};
 use super::chart::{Chart, ChartAxis, Layer, Mark};
 use super::colour::ColourMap;
 use super::heat_map::HeatMap;
@@ -67,9 +67,9 @@ impl CycleMap {
     ///
     /// # Errors
     /// Fails only if the drawing returns [`ReportError::File`].
-    pub(super) fn picture(&self, limit_um: f64) -> Result<String, ReportError> {
+    pub(super) fn picture(&self, limit_um: f64, language: Language) -> Result<String, ReportError> {
         let drawn = HeatMap::new("", "", "\u{b5}m", &self.samples_um)
-            .and_then(|map| map.with_max_size(MAP).with_limit(limit_um)?.to_plain_svg());
+            .and_then(|map| map.with_max_size(MAP).with_limit(limit_um)?.to_plain_svg(language));
         match drawn {
             Ok(svg) => Ok(within_html(&svg)),
             Err(ReportError::File(error)) => Err(error.into()),
@@ -91,7 +91,7 @@ impl CycleMap {
                 let on_line = samples.iter().filter(|s| (s[across] - extreme[across]).abs() < 1e-6);
                 let mut points: Vec<[f64; 2]> = on_line.map(|s| [s[along], s[2]]).collect();
                 points.sort_by(|a, b| a[0].total_cmp(&b[0]));
-                points
+                pieces(&points)
             };
             let title = [Text::SectionAlongX, Text::SectionAlongY][along].to(language);
             let layers: Vec<Layer> = extremes
@@ -101,7 +101,7 @@ impl CycleMap {
                 .map(|(extreme, class)| Layer {
                     name: format!("{} mm: {}", number(extreme[across], 2), signed(extreme[2], language)),
                     class: class.to_owned(),
-                    marks: vec![Mark::Line(line(extreme))],
+                    marks: line(extreme).into_iter().map(Mark::Line).collect(),
                 })
                 .collect();
             let ends = range(samples.iter().map(|s| s[along]));
@@ -140,7 +140,7 @@ impl CycleMap {
         let number = |value: f64, decimals: usize| decimal(value, decimals, language);
         let nodes = Text::Nodes.to(language);
         let chart = Chart {
-            title: format!("{}: {} {nodes}", Text::Distribution.to(language), grouped(self.samples_um.len())),
+            title: format!("{}: {} {nodes}", Text::Distribution.to(language), self.samples_um.len()),
             size: CHART,
             right_margin: 30.0,
             x: ChartAxis::new(Text::ErrorAxis.to(language), Scale::Linear, [-limit, limit], 8, &number),
@@ -150,6 +150,14 @@ impl CycleMap {
         };
         chart.to_markup()
     }
+}
+
+/// Divides a section where nodes are missing, so that no line crosses a place that was not measured.
+fn pieces(points: &[[f64; 2]]) -> Vec<Vec<[f64; 2]>> {
+    let steps = || points.windows(2).map(|pair| pair[1][0] - pair[0][0]).filter(|step| *step > 0.0);
+    let usual = steps().fold(f64::INFINITY, f64::min);
+    let is_joined = |a: &[f64; 2], b: &[f64; 2]| b[0] - a[0] < 1.5 * usual;
+    points.chunk_by(is_joined).map(<[[f64; 2]]>::to_vec).collect()
 }
 
 /// Formats an error in micrometres with its sign.
@@ -197,6 +205,14 @@ mod tests {
     }
 
     #[test]
+    fn section_ends_at_missing_nodes() {
+        let points = [[0.0, 1.0], [1.0, 2.0], [3.0, 4.0], [4.0, 5.0], [5.0, 6.0]];
+        assert_eq!(pieces(&points), [points[..2].to_vec(), points[2..].to_vec()]);
+        assert_eq!(pieces(&points[..1]), [points[..1].to_vec()]);
+        assert!(pieces(&[]).is_empty());
+    }
+
+    #[test]
     fn distribution_counts_every_node_once() {
         let svg = map().distribution(Language::En);
         roxmltree::Document::parse(&svg).unwrap();
@@ -204,12 +220,12 @@ mod tests {
         assert_eq!(svg.matches("<rect").count(), BARS, "bars");
         let flat = CycleMap { cycle: 1, samples_um: vec![[0.0, 0.0, 0.0]; 3] };
         assert!(!flat.distribution(Language::En).contains("NaN"));
-        assert!(flat.picture(1.0).unwrap().starts_with("<p>"), "one place is no map");
+        assert!(flat.picture(1.0, Language::En).unwrap().starts_with("<p>"), "one place is no map");
     }
 
     #[test]
     fn picture_marks_extremes() {
-        let svg = map().picture(5.0).unwrap();
+        let svg = map().picture(5.0, Language::En).unwrap();
         roxmltree::Document::parse(&svg).unwrap();
         assert!(svg.contains("+4.20") && svg.contains("\u{2212}3.00") && svg.contains("\u{b5}m"), "{svg}");
     }

@@ -2,9 +2,19 @@
 
 use super::maps::CycleMap;
 use super::run_history::RunHistory;
+use super::shop_header::ShopHeader;
 use super::texts::ReportText as Text;
 use regrind_journal::Verified;
 use regrind_language::Language;
+
+/// Options of a report: everything that it has besides its record.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ReportOptions {
+    /// Language of the texts.
+    pub language: Language,
+    /// Header of the shop; `None` for none.
+    pub header: Option<ShopHeader>,
+}
 
 /// Content of a report.
 pub(super) struct Report<'r> {
@@ -13,6 +23,7 @@ pub(super) struct Report<'r> {
     /// Maps of the first and of the last cycle.
     pub(super) maps: Vec<CycleMap>,
     pub(super) language: Language,
+    pub(super) header: Option<&'r ShopHeader>,
 }
 
 impl Report<'_> {
@@ -24,6 +35,11 @@ impl Report<'_> {
     /// Returns the serial number of the part, or the name of the run if it has none.
     pub(super) fn serial(&self) -> &str {
         self.story.begin.as_ref().map_or_else(|| self.run(), |begin| &begin.part)
+    }
+
+    /// Returns the mark of a simulation for captions; empty for a real run.
+    pub(super) fn mark(&self) -> &'static str {
+        if self.story.start.simulation == Some(true) { " SIMULATION" } else { "" }
     }
 
     pub(super) fn run(&self) -> &str {

@@ -11,6 +11,9 @@
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD as BASE64;
+
 use super::ReportError;
 use super::chart::PAPER;
 use super::convergence::convergence;
@@ -18,44 +21,56 @@ use super::equipment::{equipment, last_model, last_registration, registered};
 use super::first_page::first_page;
 use super::form::form;
 use super::maps::read_maps;
-use super::report_content::{Report, when};
+use super::report_content::{Report, ReportOptions, when};
 use super::run_history::{AlarmHistory, Measurement, Order, RunHistory};
+use super::shop_header::ShopHeader;
 use super::texts::{self, ReportText as Text};
 use super::words::{judgement_words, role_words, verdict_words};
 use regrind_cell::{Figures, PvPoints, RecordedParameter, Tolerance};
 use regrind_formats::run_files::RunFile;
 use regrind_formats::{escaped, write_atomic};
-use regrind_language::Language;
+use regrind_language::{Language, decimal};
 use regrind_record::TouchCounts;
 
 const STYLE: &str = include_str!("report.css");
 
-/// Verifies the record in the run folder `folder`, writes the HTML report of the run (`report.html`) in `language` into
-/// this folder, and returns its path.
+/// Verifies the record in the run folder `folder`, writes the HTML report of the run (`report.html`) into this folder, and returns its path.
 ///
 /// # Errors
 /// Fails if the record is missing or does not pass verification, if a file on record cannot be read, or if the report
 /// cannot be written.
-pub fn write_run_report(folder: &Path, language: Language) -> Result<PathBuf, ReportError> {
+pub fn write_run_report(folder: &Path, options: &ReportOptions) -> Result<PathBuf, ReportError> {
     let path = folder.join(RunFile::Report.name());
-    write_atomic(&path, run_report(folder, language)?.as_bytes())?;
+    write_atomic(&path, run_report(folder, options)?.as_bytes())?;
     Ok(path)
 }
 
-/// Verifies the record in the run folder `folder` and returns the report of the run in `language` as HTML.
+/// Verifies the record in the run folder `folder` and returns the report of the run as HTML.
 ///
 /// # Errors
 /// Fails if the record is missing or does not pass verification, or if a file on record cannot be read.
-pub fn run_report(folder: &Path, language: Language) -> Result<String, ReportError> {
+pub fn run_report(folder: &Path, options: &ReportOptions) -> Result<String, ReportError> {
     let (story, verified) = RunHistory::read_verified(folder)?;
-    html(&Report { story: &story, verified: &verified, maps: read_maps(&story, folder)?, language }, folder)
+    let ReportOptions { language, header } = options;
+    let maps = read_maps(&story, folder)?;
+    let content = Report { story: &story, verified: &verified, maps, language: *language, header: header.as_ref() };
+    html(&content, folder)
 }
 
-/// Returns the language of a report, from the text of its file. Returns `None` if it states none of the languages.
-pub fn report_language(html: &str) -> Option<Language> {
+/// Returns the options with which a report was made, from the text of its file: its language, and its header. Returns
+/// `None` if it states none of the languages, or a header that Regrind would not write.
+pub fn report_options(html: &str) -> Option<ReportOptions> {
     let tag = html.split("<html lang=\"").nth(1)?.split('"').next()?;
-    Language::first_of(tag)
+    let language = Language::first_of(tag)?;
+    let Some(written) = html.split(HEADER_MARK).nth(1) else { return Some(ReportOptions { language, header: None }) };
+    let text = BASE64.decode(written.split('"').next()?.as_bytes()).ok()?;
+    let header: ShopHeader = serde_json::from_slice(&text).ok()?;
+    header.check().ok()?;
+    Some(ReportOptions { language, header: Some(header) })
 }
+
+/// Begin of the element in which a report states its header, so that the same report can be made from the record again.
+const HEADER_MARK: &str = "<meta name=\"regrind-header\" content=\"";
 
 fn html(report: &Report, folder: &Path) -> Result<String, ReportError> {
     let Report { story, verified, language, .. } = report;
@@ -63,15 +78,23 @@ fn html(report: &Report, folder: &Path) -> Result<String, ReportError> {
     let title = format!("{}, {}", name.unwrap_or("Part"), report.run());
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"{}\">\n<head>\n<meta charset=\"utf-8\"/>\n\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n<title>{}</title>\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n{}<title>{}</title>\n\
          <style>{STYLE}{PAPER}{}</style>\n</head>\n<body>\n",
         language.tag(),
+        header_element(report),
         escaped(&title),
         running_foot(report),
     );
     let registration = last_registration(story, folder)?;
     html += &first_page(report, registration.as_ref().map(|(_, found)| found))?;
-    html += "<section class=\"details\">\n";
+    let _ = writeln!(
+        html,
+        "<section class=\"details\">\n<p class=\"caption\">{} {}, {}{}</p>",
+        report.say(Text::Serial),
+        escaped(report.serial()),
+        escaped(report.run()),
+        report.mark()
+    );
     html += &charts(report);
     html += &registration
         .map_or(String::new(), |(cycle, found)| registered(report, cycle, &found, last_model(story, folder).as_ref()));
@@ -99,6 +122,14 @@ fn html(report: &Report, folder: &Path) -> Result<String, ReportError> {
         report.say(Text::VerifyHint),
     );
     Ok(html)
+}
+
+/// Returns the element with the header of the shop, in JSON and base 64.
+fn header_element(report: &Report) -> String {
+    let Some(header) = report.header else { return String::new() };
+    // The header has texts only, so the conversion cannot fail.
+    let text = serde_json::to_vec(header).unwrap_or_default();
+    format!("{HEADER_MARK}{}\"/>\n", BASE64.encode(text))
 }
 
 /// Returns the style of the margins of printed pages: the serial number, the mark of a simulation, and the number of the
@@ -160,10 +191,10 @@ fn cycles(report: &Report) -> String {
         report.say(Text::Level),
     );
     for (number, cycle) in &story.cycles {
-        let level = cycle.level_um.map_or("-".to_owned(), |level| format!("{level:.1}"));
+        let level = cycle.level_um.map_or("-".to_owned(), |level| decimal(level, 1, report.language));
         let none = [Measurement { unusable: Some("not measured".into()), ..Measurement::default() }];
         let measurements = if cycle.measurements.is_empty() { &none[..] } else { &cycle.measurements };
-        html.extend(measurements.iter().map(|of| measurement(*number, of, tolerance.as_ref(), &level)));
+        html.extend(measurements.iter().map(|of| measurement(report, *number, of, tolerance.as_ref(), &level)));
     }
     let touches = story.touches.map_or(String::new(), |TouchCounts { taken, whole_patterns }| {
         let [touches, whole] = [Text::Touches, Text::WholePatterns].map(|text| report.say(text));
@@ -193,6 +224,7 @@ fn parameters(story: &RunHistory) -> String {
             total_correction,
             rms_reduction_um,
         } = of;
+        let unit = escaped(unit);
         format!(
             "<tr><td class=\"n\">{number}</td><td>{}</td><td class=\"n\">{estimate:.2} \u{b1} {expanded_uncertainty:.2} {unit}</td>\
              <td class=\"n\">{compensated:.2} {unit}</td><td class=\"n\">{total_correction:.2} {unit}</td><td class=\"n\">{rms_reduction_um:.2}</td></tr>\n",
@@ -223,10 +255,10 @@ fn um(mm: f64) -> String {
     format!("{:.2}", 1e3 * mm)
 }
 
-fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, level: &str) -> String {
+fn measurement(report: &Report, number: u32, of: &Measurement, tolerance: Option<&Tolerance>, level: &str) -> String {
     let (judged, reason) = judgement_of(of);
     let figures = match &of.figures {
-        Some(figures) => figures_row(figures, tolerance, level),
+        Some(figures) => figures_row(report, figures, tolerance, level),
         None => "<td class=\"n\">-</td>".repeat(6),
     };
     let remarks = of.figures.iter().flat_map(|figures| figures.weak_directions.iter().chain(&figures.warnings));
@@ -244,21 +276,22 @@ fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, lev
 /// of the last cell: the height of the target surface above the nominal surface in micrometres, or "-". With a
 /// `tolerance`, PV and RMS are the figures that are compared with the limits. Without a `tolerance`, PV and RMS are
 /// those of all measured points.
-fn figures_row(f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> String {
+fn figures_row(report: &Report, f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> String {
+    let number = |value: f64, digits: usize| decimal(value, digits, report.language);
     // Each record contains the tolerance of the run; if the run ended before that, the figures of the points are shown.
     let points = || [[f.pv_mm, f.pv_expanded_mm], [f.rms_mm, f.rms_expanded_mm]];
     let of = |tolerance: &Tolerance| tolerance.compare(f).map(|compared| [compared.median_mm, compared.expanded_mm]);
     let [[pv_mm, pv_expanded_mm], [rms_mm, rms_expanded_mm]] = tolerance.map_or_else(points, of);
     format!(
-        "<td class=\"n\">{} \u{b1} {}</td><td class=\"n\">{:.3} \u{b1} {:.3}</td><td class=\"n\">{}</td><td class=\"n\">{}</td>\
-         <td class=\"n\">{:.1} %</td><td class=\"n\">{level}</td>",
-        um(pv_mm),
-        um(pv_expanded_mm),
-        1e3 * rms_mm,
-        1e3 * rms_expanded_mm,
+        "<td class=\"n\">{} \u{b1} {}</td><td class=\"n\">{} \u{b1} {}</td><td class=\"n\">{}</td><td class=\"n\">{}</td>\
+         <td class=\"n\">{} %</td><td class=\"n\">{level}</td>",
+        number(1e3 * pv_mm, 2),
+        number(1e3 * pv_expanded_mm, 2),
+        number(1e3 * rms_mm, 3),
+        number(1e3 * rms_expanded_mm, 3),
         f.points,
         f.outliers,
-        1e2 * f.coverage
+        number(1e2 * f.coverage, 1)
     )
 }
 
@@ -284,7 +317,8 @@ fn definitions(report: &Report) -> String {
         PvPoints::MostPoints => Text::PvOfAperture,
     });
     let [title, text] = [Text::Definitions, Text::Definition].map(|text| report.say(text));
-    format!("<h2>{title}</h2>\n<p>{text} {pv}</p>\n")
+    let rule = if tolerance.with_uncertainty { report.say(Text::RuleOfRejection) } else { "" };
+    format!("<h2>{title}</h2>\n<p>{text} {pv} {rule}</p>\n")
 }
 
 /// Returns the files from which the run was made, with their hashes, the person and the program.

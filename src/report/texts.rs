@@ -14,7 +14,7 @@ regrind_language::texts! {
     // Judged figures.
     JudgedFigures MeasuredFigures Figure Result Uncertainty CredibleInterval Limit AgainstLimit InTolerance Decision
     NoLimit WithinLimit Undecided BeyondLimit AtMost AtLeast RuleWithUncertainty RuleWithoutUncertainty
-    Definitions Definition PvOfPoints PvOfAperture
+    Definitions Definition RuleOfRejection PvOfPoints PvOfAperture
     // Maps and charts.
     ErrorOfForm HowItGotThere ScaleOfTolerance ScaleOfMap ScaleOfFirst SignOfMap MapsFiltered Sections SectionAlongX
     SectionAlongY Convergence Distribution Nodes ErrorAxis LimitOf

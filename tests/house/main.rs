@@ -35,7 +35,11 @@ const ARROWS: [(&str, &str, &[&str]); 27] = [
     ("plant", "src/plant", &["document", "formats", "journal", "page", "report", "trust"]),
     ("record", "src/record", &["cell", "formats", "journal"]),
     ("language", "src/language", &["cell"]),
-    ("report", "src/report", &["cell", "journal", "formats", "geometry", "language", "record", "registration"]),
+    (
+        "report",
+        "src/report",
+        &["cell", "document", "journal", "formats", "geometry", "language", "record", "registration"],
+    ),
     ("page", "src/page", &["cell", "control", "document", "formats", "language", "report"]),
     (
         "drive",
@@ -321,6 +325,7 @@ fn crates_depend_downwards_only() {
             &[
                 "regrind-cell",
                 "regrind-core",
+                "regrind-document",
                 "regrind-figures",
                 "regrind-formats",
                 "regrind-journal",

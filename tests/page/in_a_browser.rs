@@ -184,8 +184,11 @@ fn adaptive_map_shows_uncertainty() {
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&shown.url, SCREEN);
     tab.click(&mut browser, "[data-order=resume]");
-    tab.until(&mut browser, "document.querySelectorAll('#cycle option').length > 0");
-    tab.click(&mut browser, "[data-order=hold]");
+    // The cell is held as soon as it has a map, however slow the browser is.
+    let map = shown.folder.join("cycle-1/error_map.csv");
+    shown.run.until("a first map", |_| map.exists().then_some(()));
+    let held = crate::program::run(&["hold", &shown.folder.display().to_string()], home.path());
+    assert_eq!(held.0, 0, "{held:?}");
     tab.until(&mut browser, &banner("HELD"));
     tab.click(&mut browser, "[data-view=sigma]");
     tab.until(&mut browser, "document.querySelector('#reading').innerText.includes('Standard uncertainty')");
@@ -411,6 +414,8 @@ fn pictures_are_made() {
     tab.until(&mut browser, "document.querySelectorAll('#cycle option').length > 0");
     tab.until(&mut browser, "document.querySelector('.steps .now progress')?.value > 300");
     let picture = |tab: &Tab, browser: &mut Browser, name: &str| {
+        // A tab in the background is not painted.
+        tab.send(browser, "Page.bringToFront", json!({}));
         // Wait for the last bytes to be painted. The picture is checked before it is kept.
         std::thread::park_timeout(std::time::Duration::from_secs(1));
         let shot = tab.send(browser, "Page.captureScreenshot", json!({ "format": "png" }));
@@ -421,12 +426,23 @@ fn pictures_are_made() {
         assert!(shell.wait().unwrap().success());
     };
     picture(&tab, &mut browser, "page.png");
+    let machines = browser.open(&shown.url, [1366, 768]);
+    machines.until(&mut browser, "document.querySelector('.banner')");
+    let place = shown.url.split("/?").next().unwrap();
+    machines.send(&mut browser, "Page.navigate", json!({ "url": format!("{place}/machines") }));
+    machines.until(&mut browser, "document.querySelectorAll('.machines .chart').length >= 4");
+    picture(&machines, &mut browser, "page-machines.png");
+    tab.until(&mut browser, "document.querySelector('#cycle').value === 'live'");
+    picture(&tab, &mut browser, "page-measuring.png");
     let phone = browser.open(&shown.url, [390, 844]);
     phone.until(&mut browser, &banner("EXECUTE"));
     picture(&phone, &mut browser, "page-phone.png");
     tab.until(&mut browser, &banner("ACCEPTED"));
     tab.click(&mut browser, "[data-view=relief]");
     picture(&tab, &mut browser, "page-relief.png");
+    machines.send(&mut browser, "Page.navigate", json!({ "url": format!("{place}/runs/{}/record", shown.id) }));
+    machines.until(&mut browser, "document.querySelector('.record table')");
+    picture(&machines, &mut browser, "page-record.png");
     assert_eq!(shown.run.end().0, 0);
     let run = only_run(&home.path().join("runs"));
     let report = browser.open(&format!("file://{}", run.join("report.html").display()), [1000, 1000]);

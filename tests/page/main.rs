@@ -63,6 +63,7 @@ fn serve(home: &Path) -> (Running, String) {
 }
 
 fn serve_with(home: &Path, arguments: &[&str]) -> (Running, String) {
+    std::fs::create_dir_all(home.join("runs")).unwrap();
     let mut page = Running::new(regrind(&[&["serve", "--runs", "runs"], arguments].concat(), home));
     let line = page.line("address of the page", |line| line.starts_with("page "));
     let url = line.trim_start_matches("page").trim().to_owned();

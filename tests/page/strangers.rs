@@ -121,7 +121,7 @@ fn cookies_of_two_cells_do_not_clash() {
 #[test]
 fn foreign_host_and_outside_path_refused() {
     let home = tempfile::tempdir().unwrap();
-    std::fs::create_dir(home.path().join("runs")).unwrap();
+    std::fs::create_dir_all(home.path().join("runs")).unwrap();
     std::fs::write(home.path().join("secret.html"), "secret").unwrap();
     let (_page, url) = serve(home.path());
     let visitor = Visitor::with_key(&url);
@@ -180,7 +180,7 @@ fn unfinished_requests_block_nobody() {
 #[test]
 fn unfinished_bodies_block_nobody() {
     let home = tempfile::tempdir().unwrap();
-    std::fs::create_dir(home.path().join("runs")).unwrap();
+    std::fs::create_dir_all(home.path().join("runs")).unwrap();
     assert_eq!(add(home.path(), "operator", "operator", PASSWORD).0, 0);
     let (_page, url) = serve_with(home.path(), &["--listen", "127.0.0.1:0", "--users", "users.toml"]);
     let before = Visitor::signed_in(&url, "operator", PASSWORD).expect("signed in");

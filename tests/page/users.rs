@@ -190,7 +190,7 @@ fn wrong_passwords_are_throttled() {
 #[test]
 fn removed_user_is_signed_out() {
     let home = tempfile::tempdir().unwrap();
-    std::fs::create_dir(home.path().join("runs")).unwrap();
+    std::fs::create_dir_all(home.path().join("runs")).unwrap();
     for name in ["stays", "goes", "changes"] {
         assert_eq!(add(home.path(), name, "operator", PASSWORD).0, 0);
     }
@@ -244,7 +244,7 @@ pub fn certificate(home: &Path) -> (String, String, Arc<ClientConfig>) {
 #[cfg_attr(not(feature = "https"), ignore = "needs TLS: --features https")]
 fn tls_accepts_certificate_names_only() {
     let home = tempfile::tempdir().unwrap();
-    std::fs::create_dir(home.path().join("runs")).unwrap();
+    std::fs::create_dir_all(home.path().join("runs")).unwrap();
     assert_eq!(add(home.path(), "A. Smith", "operator", PASSWORD).0, 0);
     let (certificate, key, tls) = certificate(home.path());
     let (_page, url) = serve_with(

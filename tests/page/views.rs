@@ -351,7 +351,7 @@ fn path_of_wheel_is_served() {
 #[test]
 fn settings_and_components_are_shown() {
     let home = tempfile::tempdir().unwrap();
-    std::fs::create_dir(home.path().join("runs")).unwrap();
+    std::fs::create_dir_all(home.path().join("runs")).unwrap();
     for role in ["viewer", "engineer"] {
         assert_eq!(crate::users::add(home.path(), role, role, crate::users::PASSWORD).0, 0);
     }

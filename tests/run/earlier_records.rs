@@ -51,7 +51,7 @@ fn earlier_records_verify_and_read_as_before() {
         assert_eq!((code, said.as_str()), (0, before.as_str()), "{name}");
         let summary = run_summary(&folder).unwrap();
         assert_eq!(summary.result, result, "{name}");
-        let report = run_report(&folder, regrind::report::Language::En).unwrap();
+        let report = run_report(&folder, &regrind::report::ReportOptions::default()).unwrap();
         assert!(report.contains(&summary.run) && report.contains(&summary.verdict), "{name}");
         let cell = if ["figures", "layout-1"].contains(&name) { "not on record" } else { "cell.toml" };
         let cell = if name == "table-9" { "sim" } else { cell };

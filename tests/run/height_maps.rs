@@ -318,9 +318,10 @@ async fn interferometer_maps_close_the_loop() {
         assert!(cycle.join(name).is_file(), "{name}");
     }
     // The report verifies the record and shows these results.
-    let report =
-        fs::read_to_string(regrind::report::write_run_report(&ran.folder, regrind::report::Language::En).unwrap())
-            .unwrap();
+    let report = fs::read_to_string(
+        regrind::report::write_run_report(&ran.folder, &regrind::report::ReportOptions::default()).unwrap(),
+    )
+    .unwrap();
     let notation = figures["iso_10110_5"]["notation"].as_str().unwrap();
     println!("{notation}");
     for words in ["<td>PVr</td>", "highest (stock left)", "36 Legendre terms", &notation.replace('<', "&lt;")] {

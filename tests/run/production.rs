@@ -285,7 +285,7 @@ impl Production {
         let ending = drive.run().await;
         drop(orders);
         showing.await.unwrap();
-        regrind::report::write_run_report(&folder, regrind::report::Language::En).unwrap();
+        regrind::report::write_run_report(&folder, &regrind::report::ReportOptions::default()).unwrap();
         let verified = verify(&folder).unwrap();
         assert!(verified.closed && verified.open_intents.is_empty(), "part {part}: {verified:?}");
         fs::remove_dir_all(&folder).unwrap();

@@ -9,7 +9,7 @@ use regrind::cell::{
     Verdict, sample_events,
 };
 use regrind::journal::{Entry, Header, Journal, Reader, RecordKind};
-use regrind::report::{Language, run_report, write_run_report};
+use regrind::report::{ReportOptions, run_report, write_run_report};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -22,7 +22,7 @@ impl Page {
     /// Returns the report in the folder of a run, after a check that it equals the one generated from the record.
     pub fn read(folder: &Path) -> Self {
         let html = fs::read_to_string(folder.join("report.html")).unwrap();
-        assert_eq!(html, run_report(folder, Language::En).unwrap());
+        assert_eq!(html, run_report(folder, &ReportOptions::default()).unwrap());
         Self { html }
     }
 
@@ -223,7 +223,7 @@ fn report_shows_figures_with_limits() {
     assert!(rows.len() == 12, "{rows:?}");
     for (row, told) in rows.iter().zip(told.as_array().unwrap()) {
         assert_eq!(row[0], told["name"].as_str().unwrap());
-        assert!(row[row.len() - 4].contains(" to "), "{row:?}");
+        assert!(row[row.len() - 4].contains(" \u{2026} "), "{row:?}");
         let [low, median, high] = ["low", "median", "high"].map(|key| told[key].as_f64().unwrap());
         assert!(low <= median && median <= high && told["raw"].is_number(), "{told}");
     }
@@ -343,7 +343,7 @@ impl RecordWriter {
         let Self { home, journal, at } = self;
         let folder = journal.folder().to_owned();
         journal.close(at, 1, json!({ "simulation": false, "ending": ending, "cycles": [] })).unwrap();
-        write_run_report(&folder, regrind::report::Language::En).unwrap();
+        write_run_report(&folder, &regrind::report::ReportOptions::default()).unwrap();
         (home, folder)
     }
 }
@@ -543,4 +543,49 @@ fn report_in_every_language() {
     }
     let (code, _, errors) = run(&["report", path, "--language", "fr"], home.path());
     assert!(code == 2 && errors.contains("en, de, zh"), "{errors}");
+}
+
+/// A header of a shop: in the report with its logo and its fields, and known by `audit verify`. A bad one is refused with
+/// its reason, and leaves the report as it was.
+#[test]
+fn report_with_header_of_shop() {
+    let home = tempfile::tempdir().unwrap();
+    let arguments = arguments(&small_recipe(home.path(), 1e4));
+    let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());
+    assert_eq!(code, 0, "{out}{errors}");
+    let folder = the_run(home.path());
+    let path = folder.to_str().unwrap();
+    let write = |text: &str| fs::write(home.path().join("shop.toml"), text).unwrap();
+    let report = || run(&["report", path, "--header", "shop.toml"], home.path());
+    fs::write(home.path().join("logo.svg"), "<svg xmlns='http://www.w3.org/2000/svg'/>").unwrap();
+    let good = "name = \"Optics <&> Co\"\naddress = [\"1 Lens Lane\"]\nlogo = \"logo.svg\"\n[[fields]]\nname = \"Order\"\ntext = \"4711\"\n";
+    write(good);
+    assert_eq!(report().0, 0);
+    let html = fs::read_to_string(folder.join("report.html")).unwrap();
+    roxmltree::Document::parse(html.strip_prefix("<!DOCTYPE html>\n").unwrap()).unwrap();
+    for piece in ["Optics &lt;&amp;&gt; Co", "1 Lens Lane", "data:image/svg+xml;base64,", "<th>Order</th><td>4711</td>"]
+    {
+        assert!(html.contains(piece), "{piece}");
+    }
+    let verify = || run(&["audit", "verify", path], home.path());
+    // The header is in the report alone, and is named as such.
+    let (code, said, _) = verify();
+    assert!(
+        code == 0 && said.contains("header      of report.html: Optics <&> Co") && !said.contains("differs"),
+        "{said}"
+    );
+    // Another number of the order is another report.
+    fs::write(folder.join("report.html"), html.replace("<td>4711</td>", "<td>4712</td>")).unwrap();
+    assert!(verify().1.contains("report.html differs"), "{:?}", verify());
+    for (bad, words) in [
+        ("nam = \"a\"", "unknown field"),
+        ("name = \"\"", "1 to 200"),
+        ("name = \"a\"\nlogo = \"shop.toml\"", "no PNG, JPEG or SVG"),
+        ("name = \"a\"\nlogo = \"nothing.png\"", "nothing.png"),
+    ] {
+        write(bad);
+        let (code, _, errors) = report();
+        assert!(code == 2 && errors.contains(words), "{bad}: {errors}");
+    }
+    assert!(fs::read_to_string(folder.join("report.html")).unwrap().contains("<td>4712</td>"), "left as it was");
 }

@@ -477,7 +477,7 @@
   };
   canvas.addEventListener("pointerdown", (event) => {
     isDragged = isPinned;
-    [panned, hasPanned] = [zoom && seen && !isPinned ? placeOf(event) : null, false];
+    [panned, hasPanned] = [zoom && seen && !isPinned ? [...placeOf(event), event.clientX, event.clientY] : null, false];
   });
   canvas.addEventListener("wheel", (event) => {
     if (!event.ctrlKey || !seen) return;
@@ -492,9 +492,11 @@
   });
   for (const end of ["pointerup", "pointercancel"]) addEventListener(end, () => { [isDragged, panned] = [false, null]; });
   canvas.addEventListener("pointermove", (event) => {
-    if (panned && event.buttons) {
+    if (panned && event.buttons && seen) {
+      // A hand that only clicks moves a little too.
+      hasPanned = hasPanned || Math.hypot(event.clientX - panned[2], event.clientY - panned[3]) > 4;
+      if (!hasPanned) return;
       const [x, y] = placeOf(event);
-      hasPanned = true;
       return panBy(panned[0] - x, panned[1] - y);
     }
     if (isDragged || !isPinned) moveMark(event);

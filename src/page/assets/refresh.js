@@ -3,18 +3,19 @@
 document.addEventListener("DOMContentLoaded", () => {
   const main = document.querySelector("main");
   const interval = Number(main.dataset.refreshMs);
-  if (interval) {
-    setInterval(async () => {
-      if (document.hidden) return;
-      const answer = await fetch(location.href).catch(() => null);
-      if (!answer || !answer.ok) return document.body.classList.add("old");
-      const next = new DOMParser().parseFromString(await answer.text(), "text/html").querySelector("main");
-      if (!next || !next.className.includes("machines")) return;
-      document.body.classList.remove("old");
+  const again = async () => {
+    const answer = document.hidden ? null : await fetch(location.href).catch(() => null);
+    if (!document.hidden) document.body.classList.toggle("old", !answer || !answer.ok);
+    const text = answer && answer.ok ? await answer.text() : "";
+    const next = text && new DOMParser().parseFromString(text, "text/html").querySelector("main.machines");
+    if (next) {
       main.replaceChildren(...next.childNodes);
       regrindTimes(main);
-    }, interval);
-  }
+    }
+    // The program of the run no longer answers: nothing changes any more.
+    if (!next || next.dataset.refreshMs) setTimeout(again, interval);
+  };
+  if (interval) setTimeout(again, interval);
   const [themes, languages] = ["theme", "language"].map((id) => document.getElementById(id));
   const showTheme = () => document.querySelectorAll("[data-theme-choice]").forEach((button) => {
     button.setAttribute("aria-pressed", String(button.dataset.themeChoice === themes.value));

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use data_encoding::HEXLOWER;
 use jiff::Timestamp;
 use regrind_formats::{FormatError, ScratchFolder};
-use regrind_report::{Language, ReportError, ResultsFormat, run_report, run_results};
+use regrind_report::{ReportError, ReportOptions, ResultsFormat, run_report, run_results};
 use tokio::task::spawn_blocking;
 
 use super::super::copy::PlantRun;
@@ -66,7 +66,7 @@ async fn prove(plant: &PlantPage, cell: &str, name: &str) -> Result<Proof, Plant
         Proof {
             at: now(),
             keys: run.keys.len(),
-            report: run_report(&folder, Language::En).map_err(words),
+            report: run_report(&folder, &ReportOptions::default()).map_err(words),
             qif: run_results(&folder, ResultsFormat::Qif).map_err(words),
             dfq: run_results(&folder, ResultsFormat::Dfq).map_err(words),
             outcome: found,
