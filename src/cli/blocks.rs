@@ -55,9 +55,11 @@ impl Blocks {
         let pixel_mm = (wide / most[0] as f64).max(deep / (2 * most[1]) as f64).max(spacing_mm);
         let [columns, lines] = [wide, deep].map(|size| ((size / pixel_mm).round() as usize).max(1));
         let mut sums = vec![(0.0, 0_u32); columns * lines];
+        // A node at the edge of a pixel must not fall into the one before it by rounding, which would leave it empty.
+        const ROUNDING: f64 = 1e-9;
         for [x, y, value_mm] in nodes {
-            let column = (((x - x0) / wide * columns as f64) as usize).min(columns - 1);
-            let line = (((y1 - y) / deep * lines as f64) as usize).min(lines - 1);
+            let column = (((x - x0) / wide * columns as f64 + ROUNDING) as usize).min(columns - 1);
+            let line = (((y1 - y) / deep * lines as f64 + ROUNDING) as usize).min(lines - 1);
             let (sum, count) = &mut sums[line * columns + column];
             (*sum, *count) = (*sum + value_mm, *count + 1);
         }
