@@ -23,7 +23,8 @@ fn words(list: &toml::Value) -> BTreeSet<&str> {
 fn packages(platform: &str) -> Vec<Value> {
     let output = Command::new(env!("CARGO"))
         .args(["metadata", "--format-version=1", "--offline", "--locked", "--filter-platform", platform])
-        .args(cfg!(feature = "plant").then_some("--all-features"))
+        .args(cfg!(feature = "plant").then_some("--features=plant"))
+        .args(cfg!(feature = "pdf").then_some("--features=pdf"))
         .current_dir(env!("CARGO_MANIFEST_DIR"))
         .output()
         .unwrap();

@@ -10,7 +10,7 @@ use regrind::journal::{
     Anchor, DATABASE, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Verified, verify_against,
 };
 use regrind::record::{Begin, RunContent, begin_of};
-use regrind::report::{report_options, run_report, words};
+use regrind::report::{Paper, ReportOptions, report_options, run_report, run_report_pdf, words};
 use serde_json::json;
 
 use super::Outcome;
@@ -220,34 +220,51 @@ fn is_folder_of_runs(folder: &Path) -> bool {
 }
 
 /// Returns lines of text about files in the run folder `folder` that the journal does not list. `unrecorded` contains
-/// the names of these files. The file `report.html` is reported only if it differs from a report made from the journal
-/// now. Returns an empty text if there is nothing to report.
+/// the names of these files. A report is named only if it differs from the report that is made from the journal now.
+/// Returns an empty text if there is nothing to report.
 fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
-    let report = RunFile::Report.name();
-    let text = std::fs::read_to_string(folder.join(report)).unwrap_or_default();
+    let [html, pdf] = [RunFile::Report, RunFile::PdfReport].map(RunFile::name);
+    let text = std::fs::read_to_string(folder.join(html)).unwrap_or_default();
+    let options = report_options(&text).unwrap_or_default();
     // The header of a shop is in the file of the report alone, so anybody can change it.
-    let header = report_options(&text).and_then(|options| options.header).map_or(String::new(), |header| {
+    let mut lines = options.header.as_ref().map_or(String::new(), |header| {
         let name = regrind::document::visible(&header.name);
-        format!("header      of {report}: {name}; its name, address, logo and fields are not in the record, so not verified\n")
-    });
-    let edited = unrecorded.iter().any(|name| name == report)
-        && std::fs::read_to_string(folder.join(report)).ok().is_none_or(|text| {
-            let options = report_options(&text).unwrap_or_default();
-            run_report(folder, &options).ok().as_ref() != Some(&text)
-        });
-    let others: Vec<&str> = unrecorded.iter().map(String::as_str).filter(|name| *name != report).collect();
-    let report = if edited {
         format!(
-            "report      {report} differs from the report that Regrind now makes from the record: a person changed the file, or the version of Regrind changed\n"
+            "header      of {html}: {name}; its name, address, logo and fields are not in the record, so not verified\n"
         )
-    } else {
-        String::new()
-    };
-    let report = format!("{header}{report}");
-    match others.len() {
-        0 => report,
-        _ => format!("{report}files       not in the record, so not verified: {}\n", others.join(", ")),
+    });
+    let has = |name: &str| unrecorded.iter().any(|found| found == name);
+    if has(html) && run_report(folder, &options).ok().as_ref() != Some(&text) {
+        lines += &changed_report(html, "");
     }
+    if has(pdf) {
+        lines += &pdf_text(folder, pdf, &options);
+    }
+    let others: Vec<&str> = unrecorded.iter().map(String::as_str).filter(|name| ![html, pdf].contains(name)).collect();
+    match others.len() {
+        0 => lines,
+        _ => format!("{lines}files       not in the record, so not verified: {}\n", others.join(", ")),
+    }
+}
+
+/// Returns a line of text about the PDF report `name` if it differs from the report that is made from the journal now
+/// with `options`, on paper of either size.
+fn pdf_text(folder: &Path, name: &str, options: &ReportOptions) -> String {
+    let written = std::fs::read(folder.join(name)).unwrap_or_default();
+    let remade = Paper::ALL.map(|paper| run_report_pdf(folder, options, paper));
+    if remade.iter().any(|made| made.as_ref().is_ok_and(|made| *made == written)) {
+        return String::new();
+    }
+    match remade.into_iter().find_map(Result::err) {
+        None => changed_report(name, ", or this computer has other fonts"),
+        Some(error) => format!("report      {name} is not compared with the record: {error}\n"),
+    }
+}
+
+fn changed_report(name: &str, or: &str) -> String {
+    format!(
+        "report      {name} differs from the report that Regrind now makes from the record: a person changed the file, or the version of Regrind changed{or}\n"
+    )
 }
 
 fn read_anchor(path: &Path) -> Result<Anchor, Failure> {

@@ -5,14 +5,15 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use regrind::report::{
-    Language, MAX_LOGO_BYTES, ReportOptions, ResultsFormat, ShopHeader, logo_uri, write_run_report, write_run_results,
+    Language, MAX_LOGO_BYTES, Paper, ReportOptions, ResultsFormat, ShopHeader, logo_uri, write_run_report,
+    write_run_report_pdf, write_run_results,
 };
 
 use super::Outcome;
 use super::control::folder_of;
 use super::failure::Failure;
 
-/// Write the report of a run as one HTML file that needs no network; write its results as QIF or DFQ
+/// Write the report of a run as one HTML file that needs no network, and as PDF; write its results as QIF or DFQ
 #[derive(Args, Debug)]
 #[command(after_help = "\
 RUN is the folder of a run; by default the newest under runs/. The record is verified first. The report is
@@ -29,7 +30,7 @@ A header file has these keys; only `name` is required, and the path of the logo 
 
 Examples:
   regrind report runs/freeform-mirror-20260704T120000Z
-  regrind report runs/freeform-mirror-20260704T120000Z --language de --header shop.toml
+  regrind report runs/freeform-mirror-20260704T120000Z --language de --header shop.toml --pdf
   regrind report runs/freeform-mirror-20260704T120000Z --qif --dfq=/srv/qdas/part-17.dfq
 
 Exit codes: 0 written; 1 the record is broken; 2 no such run, no record in it, nothing measured (with --qif or --dfq), or a file
@@ -38,6 +39,12 @@ pub(super) struct Arguments {
     /// Folder of the run
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
+    /// Also write the report as PDF/A-2b, to FILE or to RUN/report.pdf
+    #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
+    pdf: Option<Option<PathBuf>>,
+    /// Size of the pages of the PDF: a4 or letter
+    #[arg(long, value_name = "SIZE", default_value = "a4", value_parser = paper)]
+    paper: Paper,
     /// Also write the results as QIF 3.0, to FILE or to RUN/results.qif
     #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
     qif: Option<Option<PathBuf>>,
@@ -85,11 +92,24 @@ fn language(text: &str) -> Result<Language, String> {
     found.ok_or_else(|| format!("this language does not exist; the languages are {}", tags.join(", ")))
 }
 
+/// Reads the size of the pages.
+fn paper(text: &str) -> Result<Paper, String> {
+    match text {
+        "a4" => Ok(Paper::A4),
+        "letter" => Ok(Paper::Letter),
+        _ => Err("this size does not exist; the sizes are a4, letter".to_owned()),
+    }
+}
+
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let folder = folder_of(arguments.run.as_deref())?;
     let header = arguments.header.as_deref().map(shop_header).transpose()?;
     let options = ReportOptions { language: arguments.language, header };
     let mut written = vec![("report", write_run_report(&folder, &options).map_err(Failure::Report)?)];
+    if let Some(path) = &arguments.pdf {
+        let pdf = write_run_report_pdf(&folder, &options, arguments.paper, path.as_deref()).map_err(Failure::Report)?;
+        written.push(("pdf", pdf));
+    }
     let wanted = [("qif", ResultsFormat::Qif, &arguments.qif), ("dfq", ResultsFormat::Dfq, &arguments.dfq)];
     for (key, format, path) in wanted {
         if let Some(path) = path {

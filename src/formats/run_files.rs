@@ -51,6 +51,8 @@ named_files! {
         Result = "result.json",
         /// Report of the run.
         Report = "report.html",
+        /// Report of the run as PDF/A.
+        PdfReport = "report.pdf",
         /// Results of the run as QIF 3.0.
         QifResults = "results.qif",
         /// Results of the run as Q-DAS ASCII.
@@ -210,7 +212,7 @@ mod tests {
         let names: Vec<&str> = RunFile::ALL.iter().map(|file| file.name()).collect();
         assert_eq!(
             names.join(" "),
-            "recipe.toml cell.toml learned_from.json learned.json result.json report.html results.qif results.dfq control.sock"
+            "recipe.toml cell.toml learned_from.json learned.json result.json report.html report.pdf results.qif results.dfq control.sock"
         );
         let names: Vec<&str> = CycleFile::ALL.iter().map(|file| file.name()).collect();
         assert_eq!(

@@ -92,9 +92,9 @@ pub(super) fn registered(report: &Report, cycle: u32, found: &Value, model: Opti
     let converged = report.say(if found["converged"] == true { Text::Converged } else { Text::NotConverged });
     let points = |key: &str| found[key].as_f64().map_or("-".to_owned(), |n| format!("{n:.0}"));
     let fit = format!(
-        "{converged}, {} {}; {} / {} {}; {} {}; {} {}; {} % {}; RMS {}",
-        points("iterations"),
+        "{converged}, {}: {}; {} / {} {}; {} {}; {} {}; {} % {}; RMS {}",
         report.say(Text::Steps),
+        points("iterations"),
         points("used"),
         points("points"),
         report.say(Text::PointsUsed),

@@ -8,7 +8,7 @@ use serde_json::Value;
 use super::ReportError;
 use super::interval_bar::interval_bar;
 use super::report_content::{Report, when};
-use super::run_history::{Measurement, PassHistory, RunHistory};
+use super::run_history::{Measurement, PassHistory};
 use super::shop_header::ShopHeader;
 use super::texts::{self, ReportText as Text};
 use super::words::{ending_words, home_words};
@@ -24,7 +24,7 @@ pub(super) fn first_page(report: &Report, registration: Option<&Value>) -> Resul
     let mut html = String::from("<article class=\"first\">\n");
     html += &report.header.map_or(String::new(), ShopHeader::html);
     html += &head(report);
-    html += &broken_off_pass(report.story);
+    html += &broken_off_pass(report);
     html += &judged(report);
     html += &maps(report)?;
     html += &how_it_got_there(report)?;
@@ -56,7 +56,7 @@ fn head(report: &Report) -> String {
         judged => format!(", {} {judged} {} {last}", report.say(Text::Cycle), report.say(Text::CountOf)),
     };
     let unrecorded = story.ending.is_some() && story.end.is_none();
-    let more = if unrecorded { "<p>The record of the run is incomplete: its end is missing.</p>\n" } else { "" };
+    let more = if unrecorded { format!("<p>{}</p>\n", report.say(Text::RecordIncomplete)) } else { String::new() };
     format!(
         "<div class=\"head\">\n<div>\n<h1>{}</h1>\n<p>{}{mark}</p>\n<p>{kind}{cycle}, {}</p>\n</div>\n\
          <div class=\"verdict {class}\"><strong>{}</strong></div>\n</div>\n<p class=\"{}\">{}</p>\n{more}",
@@ -83,31 +83,29 @@ fn outcome(report: &Report) -> (&'static str, Text, String, bool) {
         }
         (None, Some([true, true])) => ("ended", Text::MachinesHome, home_words([true, true]), true),
         (None, Some(home)) => ("failed", Text::MachinesNotHome, home_words(home), false),
-        (None, None) => ("open", Text::NotEnded, "The run has not ended.".to_owned(), false),
+        (None, None) => ("open", Text::NotEnded, report.say(Text::RunHasNotEnded).to_owned(), false),
     }
 }
 
 /// Returns an HTML paragraph about an incomplete last pass: how the pass ended, and which percentage of its path was
 /// ground, if the grinder reported this. Returns an empty text if the last pass is complete, or if no pass was started.
-fn broken_off_pass(story: &RunHistory) -> String {
-    let Some(PassHistory { cycle, ground, result }) = story.pass else { return String::new() };
+fn broken_off_pass(report: &Report) -> String {
+    let Some(PassHistory { cycle, ground, result }) = report.story.pass else { return String::new() };
     let how = match result {
         Some(JobResult::Complete) => return String::new(),
-        Some(JobResult::Stopped) => "was stopped",
-        Some(JobResult::Aborted) => "was aborted",
-        Some(JobResult::Failed) => "failed",
-        None => "has no end on record",
+        Some(JobResult::Stopped) => Text::PassStopped,
+        Some(JobResult::Aborted) => Text::PassAborted,
+        Some(JobResult::Failed) => Text::PassFailed,
+        None => Text::PassWithoutEnd,
     };
     let far = match ground {
         Some([done, total]) if total > 0 => {
-            format!(
-                "{:.0} % of the path was ground, according to the last report of the grinder",
-                100.0 * f64::from(done) / f64::from(total)
-            )
+            format!("{:.0} % {}", 100.0 * f64::from(done) / f64::from(total), report.say(Text::ShareGround))
         }
-        _ => "the share of the path that was ground is not known".to_owned(),
+        _ => report.say(Text::ShareNotKnown).to_owned(),
     };
-    format!("<p id=\"pass\">The pass of cycle {cycle} {how}: {far}; the rest of the part is unchanged.</p>\n")
+    let [cycle_word, how, rest] = [Text::Cycle, how, Text::RestUnchanged].map(|text| report.say(text));
+    format!("<p id=\"pass\">{how} ({cycle_word} {cycle}): {far}. {rest}</p>\n")
 }
 
 /// Returns the table of the judged figures of the last measurement, with their uncertainty, their limits and the
@@ -181,7 +179,7 @@ fn comparison(report: &Report, compared: &ComparedFigure, with_uncertainty: bool
         let digits = if alike { 5 } else { 2 };
         let [value, limit] = [value, limit_mm].map(|mm| decimal(1e3 * mm, digits, report.language));
         let what = text.map_or(String::new(), |text| format!("{} ", report.say(text)));
-        format!("{what}{value} {is} {limit}")
+        format!("<span class=\"whole\">{what}{value} {is} {limit}</span>")
     };
     let sums = match (with_uncertainty, conformity) {
         (false, _) => beside(None, found_mm),

@@ -25,6 +25,7 @@ mod form;
 mod heat_map;
 mod interval_bar;
 mod maps;
+mod pdf;
 mod plot;
 mod ply;
 mod qif;
@@ -52,6 +53,7 @@ pub use colour::ColourMap;
 pub use dfq::{DfqPart, dfq_of_parts};
 pub use heat_map::HeatMap;
 pub use interval_bar::interval_bar;
+pub use pdf::{Paper, run_report_pdf, write_run_report_pdf};
 pub use plot::{Axis, Plot, Series};
 pub use ply::{coloured_ply, save_coloured_ply};
 pub use record_lines::{RecordChoice, RecordLine, RecordVerification, record_lines, verify_record};
@@ -102,6 +104,14 @@ pub enum ReportError {
         "run {run}: no measurement of this run could be registered, so the run has no results to write; `regrind report` shows the reason"
     )]
     NothingMeasured { run: String },
+    /// Report that cannot be laid out as PDF.
+    #[error("run {run}: the report cannot be written as PDF: {reason}; the HTML report has the same content")]
+    Pdf { run: String, reason: String },
+    /// Program that was built without the feature `pdf`.
+    #[error(
+        "this program cannot write PDF; use a released program, or build it with `cargo build --features pdf`, or print the HTML report from a browser"
+    )]
+    NoPdf,
     /// Record of the run that cannot be read or does not pass verification.
     #[error(transparent)]
     Record(#[from] regrind_journal::JournalError),

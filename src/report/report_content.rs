@@ -42,6 +42,20 @@ impl Report<'_> {
         if self.story.start.simulation == Some(true) { " SIMULATION" } else { "" }
     }
 
+    /// Returns the title of the document.
+    pub(super) fn title(&self) -> String {
+        let [name, ..] = self.story.start.content.names();
+        format!("{}, {}", name.unwrap_or("Part"), self.run())
+    }
+
+    /// Returns the texts at the foot of each page: on the left the program and the run, on the right the serial number
+    /// and the mark of a simulation.
+    pub(super) fn foot(&self) -> [String; 2] {
+        let mark = if self.story.start.simulation == Some(true) { " \u{b7} SIMULATION" } else { "" };
+        let program = self.story.start.regrind.as_deref().unwrap_or_default();
+        [format!("Regrind {program} \u{b7} {}", self.run()), format!("{}{mark}", self.serial())]
+    }
+
     pub(super) fn run(&self) -> &str {
         self.story.start.run.as_deref().unwrap_or_default()
     }

@@ -25,14 +25,14 @@ use super::report_content::{Report, ReportOptions, when};
 use super::run_history::{AlarmHistory, Measurement, Order, RunHistory};
 use super::shop_header::ShopHeader;
 use super::texts::{self, ReportText as Text};
-use super::words::{judgement_words, role_words, verdict_words};
+use super::words::{judgement_words, verdict_words};
 use regrind_cell::{Figures, PvPoints, RecordedParameter, Tolerance};
 use regrind_formats::run_files::RunFile;
 use regrind_formats::{escaped, write_atomic};
 use regrind_language::{Language, decimal};
 use regrind_record::TouchCounts;
 
-const STYLE: &str = include_str!("report.css");
+pub(super) const STYLE: &str = include_str!("report.css");
 
 /// Verifies the record in the run folder `folder`, writes the HTML report of the run (`report.html`) into this folder, and returns its path.
 ///
@@ -50,11 +50,19 @@ pub fn write_run_report(folder: &Path, options: &ReportOptions) -> Result<PathBu
 /// # Errors
 /// Fails if the record is missing or does not pass verification, or if a file on record cannot be read.
 pub fn run_report(folder: &Path, options: &ReportOptions) -> Result<String, ReportError> {
+    with_report(folder, options, |report| html(report, folder))
+}
+
+/// Verifies the record in the run folder `folder`, and calls `write` with the content of the report of the run.
+pub(super) fn with_report<T>(
+    folder: &Path,
+    options: &ReportOptions,
+    write: impl FnOnce(&Report) -> Result<T, ReportError>,
+) -> Result<T, ReportError> {
     let (story, verified) = RunHistory::read_verified(folder)?;
     let ReportOptions { language, header } = options;
     let maps = read_maps(&story, folder)?;
-    let content = Report { story: &story, verified: &verified, maps, language: *language, header: header.as_ref() };
-    html(&content, folder)
+    write(&Report { story: &story, verified: &verified, maps, language: *language, header: header.as_ref() })
 }
 
 /// Returns the options with which a report was made, from the text of its file: its language, and its header. Returns
@@ -72,17 +80,15 @@ pub fn report_options(html: &str) -> Option<ReportOptions> {
 /// Begin of the element in which a report states its header, so that the same report can be made from the record again.
 const HEADER_MARK: &str = "<meta name=\"regrind-header\" content=\"";
 
-fn html(report: &Report, folder: &Path) -> Result<String, ReportError> {
+pub(super) fn html(report: &Report, folder: &Path) -> Result<String, ReportError> {
     let Report { story, verified, language, .. } = report;
-    let [name, ..] = story.start.content.names();
-    let title = format!("{}, {}", name.unwrap_or("Part"), report.run());
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"{}\">\n<head>\n<meta charset=\"utf-8\"/>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n{}<title>{}</title>\n\
          <style>{STYLE}{PAPER}{}</style>\n</head>\n<body>\n",
         language.tag(),
         header_element(report),
-        escaped(&title),
+        escaped(&report.title()),
         running_foot(report),
     );
     let registration = last_registration(story, folder)?;
@@ -115,7 +121,7 @@ fn html(report: &Report, folder: &Path) -> Result<String, ReportError> {
     };
     let _ = write!(
         html,
-        "</section>\n<footer><p>{records} {}, {}, {end}. {}:<br/><code>{head}</code><br/>{by}<br/>{}: <code>regrind audit verify</code></p></footer>\n</body>\n</html>\n",
+        "</section>\n<footer><p>{records} {}, {}, {end}. {}:<br/><code>{head}</code><br/>{by}<br/>{}</p></footer>\n</body>\n</html>\n",
         report.say(Text::Records),
         report.say(Text::Unbroken),
         report.say(Text::HashOfLast),
@@ -139,18 +145,15 @@ fn running_foot(report: &Report) -> String {
     let quoted = |text: &str| {
         let number = |c: char| match c {
             c if c.is_ascii_alphanumeric() || " -_.,:/".contains(c) => c.to_string(),
-            c => format!("\\{:06x}", u32::from(c)),
+            // The blank belongs to the number.
+            c => format!("\\{:06x} ", u32::from(c)),
         };
         text.chars().map(number).collect::<String>()
     };
-    let mark = if report.story.start.simulation == Some(true) { " - SIMULATION" } else { "" };
-    let program = report.story.start.regrind.as_deref().unwrap_or_default();
+    let [left, right] = report.foot().map(|text| quoted(&text));
     format!(
-        "@page{{@bottom-left{{content:\"Regrind {} - {}\"}}@bottom-right{{content:\"{}{mark} - {} \" counter(page) \" {} \" counter(pages)}}}}",
-        quoted(program),
-        quoted(report.run()),
-        quoted(report.serial()),
-        quoted(report.say(Text::Page)),
+        "@page{{@bottom-left{{content:\"{left}\"}}@bottom-right{{content:\"{right} {} \" counter(page) \" {} \" counter(pages)}}}}",
+        quoted(&format!("\u{b7} {}", report.say(Text::Page))),
         quoted(report.say(Text::CountOf)),
     )
 }
@@ -192,7 +195,7 @@ fn cycles(report: &Report) -> String {
     );
     for (number, cycle) in &story.cycles {
         let level = cycle.level_um.map_or("-".to_owned(), |level| decimal(level, 1, report.language));
-        let none = [Measurement { unusable: Some("not measured".into()), ..Measurement::default() }];
+        let none = [Measurement { unusable: Some(report.say(Text::NotMeasured).into()), ..Measurement::default() }];
         let measurements = if cycle.measurements.is_empty() { &none[..] } else { &cycle.measurements };
         html.extend(measurements.iter().map(|of| measurement(report, *number, of, tolerance.as_ref(), &level)));
     }
@@ -200,7 +203,7 @@ fn cycles(report: &Report) -> String {
         let [touches, whole] = [Text::Touches, Text::WholePatterns].map(|text| report.say(text));
         format!("<p>{touches}: {taken}; {whole} {whole_patterns}.</p>\n")
     });
-    html + "</table>\n" + &touches + &parameters(story)
+    html + "</table>\n" + &touches + &parameters(report)
 }
 
 /// Returns the HTML table of the estimated errors of machine parameters, such as the error of the wheel radius. Each
@@ -213,7 +216,9 @@ fn cycles(report: &Report) -> String {
 ///
 /// Below the table is a line for each cycle with the rms of the error that remains for the correction map. Returns an
 /// empty text if the record contains no parameters.
-fn parameters(story: &RunHistory) -> String {
+fn parameters(report: &Report) -> String {
+    let story = report.story;
+    let two_digits = |value: f64| decimal(value, 2, report.language);
     let row = |number: u32, of: &RecordedParameter| {
         let RecordedParameter {
             name,
@@ -226,9 +231,14 @@ fn parameters(story: &RunHistory) -> String {
         } = of;
         let unit = escaped(unit);
         format!(
-            "<tr><td class=\"n\">{number}</td><td>{}</td><td class=\"n\">{estimate:.2} \u{b1} {expanded_uncertainty:.2} {unit}</td>\
-             <td class=\"n\">{compensated:.2} {unit}</td><td class=\"n\">{total_correction:.2} {unit}</td><td class=\"n\">{rms_reduction_um:.2}</td></tr>\n",
-            escaped(name)
+            "<tr><td class=\"n\">{number}</td><td>{}</td><td class=\"n\">{} \u{b1} {} {unit}</td>\
+             <td class=\"n\">{} {unit}</td><td class=\"n\">{} {unit}</td><td class=\"n\">{}</td></tr>\n",
+            escaped(name),
+            two_digits(*estimate),
+            two_digits(*expanded_uncertainty),
+            two_digits(*compensated),
+            two_digits(*total_correction),
+            two_digits(*rms_reduction_um)
         )
     };
     let rows: String =
@@ -238,25 +248,26 @@ fn parameters(story: &RunHistory) -> String {
     }
     let stated = story.cycles.iter().filter(|(_, cycle)| !cycle.parameters.is_empty());
     let left = stated.filter_map(|(number, cycle)| Some((number, cycle.map_rms_mm?)));
+    let [cycle, left_for_map] = [Text::Cycle, Text::ErrorLeftForMap].map(|text| report.say(text));
     let left: String = left
-        .map(|(number, mm)| {
-            format!("<p>Error that remains for the correction map after cycle {number}: {} µm RMS.</p>\n", um(mm))
-        })
+        .map(|(number, mm)| format!("<p>{left_for_map}, {cycle} {number}: {}</p>\n", two_digits(1e3 * mm)))
         .collect();
+    let heads = [
+        (Text::Parameter, ""),
+        (Text::EstimatedError, " class=\"n\""),
+        (Text::Compensated, " class=\"n\""),
+        (Text::CorrectionOfNextPass, " class=\"n\""),
+        (Text::ReducesRmsBy, " class=\"n\""),
+    ];
+    let heads = heads.map(|(text, class)| format!("<th{class}>{}</th>", report.say(text))).concat();
     format!(
-        "<h3>Parameters of the machine</h3>\n<table id=\"parameters\">\n<tr><th class=\"n\">cycle</th><th>parameter</th>\
-         <th class=\"n\">deviation</th><th class=\"n\">compensated</th><th class=\"n\">correction of the next pass</th>\
-         <th class=\"n\">reduces the error by, \u{b5}m rms</th></tr>\n{rows}</table>\n{left}"
+        "<h3>{}</h3>\n<table id=\"parameters\">\n<thead><tr><th class=\"n\">{cycle}</th>{heads}</tr></thead>\n{rows}</table>\n{left}",
+        report.say(Text::ParametersOfMachine)
     )
 }
 
-/// Formats a length in micrometres with two decimals.
-fn um(mm: f64) -> String {
-    format!("{:.2}", 1e3 * mm)
-}
-
 fn measurement(report: &Report, number: u32, of: &Measurement, tolerance: Option<&Tolerance>, level: &str) -> String {
-    let (judged, reason) = judgement_of(of);
+    let (judged, reason) = judgement_of(report, of);
     let figures = match &of.figures {
         Some(figures) => figures_row(report, figures, tolerance, level),
         None => "<td class=\"n\">-</td>".repeat(6),
@@ -296,17 +307,16 @@ fn figures_row(report: &Report, f: &Figures, tolerance: Option<&Tolerance>, leve
 }
 
 /// Returns two texts about a measurement: the verdict of its last judgement, and the reason for it. The earlier
-/// judgements of the same measurement follow after the reason. If the measurement was not judged, the verdict is "not
-/// judged", or "no figures" if the measurement has no figures. The second text is then the reason why the measurement
-/// is not usable, or empty.
-fn judgement_of(measurement: &Measurement) -> (String, String) {
-    let unusable = || measurement.unusable.clone().unwrap_or_default();
+/// judgements of the same measurement follow after the reason. If the measurement was not judged, the first text says so,
+/// and the second one is the reason why the measurement is not usable, or empty.
+fn judgement_of(report: &Report, measurement: &Measurement) -> (String, String) {
     let Some((last, earlier)) = measurement.judgements.split_last() else {
-        let found = if measurement.figures.is_some() { "not judged" } else { "no figures" };
-        return (found.to_owned(), unusable());
+        let found = if measurement.figures.is_some() { Text::NotJudged } else { Text::NoFigures };
+        return (report.say(found).to_owned(), measurement.unusable.clone().unwrap_or_default());
     };
     let earlier: String = earlier.iter().map(|earlier| format!("; first {}", judgement_words(earlier))).collect();
-    (verdict_words(last), format!("{}{earlier}", last.reason))
+    let verdict = texts::verdict(last.verdict).map_or_else(|| verdict_words(last), |text| report.say(text).to_owned());
+    (verdict, format!("{}{earlier}", last.reason))
 }
 
 /// Returns the definitions of the figures, with the rule by which the part was judged.
@@ -347,19 +357,38 @@ fn traceability(report: &Report) -> String {
     format!("<h2>{}</h2>\n<table id=\"sources\">\n{rows}</table>\n", report.say(Text::Traceability))
 }
 
+/// Returns the table of the alarms. Each alarm has a row with its times and the people who can clear it, and a second row
+/// with its cause, consequence and remedy.
 fn alarms(report: &Report) -> String {
+    let title = report.say(Text::Alarms);
+    if report.story.alarms.is_empty() {
+        return format!("<h2>{title}</h2>\n<p>{}</p>\n", report.say(Text::NoAlarm));
+    }
     let row = |told: &AlarmHistory| {
         let withdrawn = told.withdrawn.as_deref().map_or(report.say(Text::NotWithdrawn).to_owned(), when);
-        [when(&told.raised), withdrawn, texts::alarm(&told.alarm, report.language), role_words(&told.alarm)]
+        format!(
+            "<tr class=\"of\"><td class=\"t\">{}</td><td class=\"t\">{}</td><td class=\"t\">{}</td></tr>\n<tr><td colspan=\"3\">{}</td></tr>\n",
+            escaped(&when(&told.raised)),
+            escaped(&withdrawn),
+            escaped(&texts::role(told.alarm.cleared_by, report.language)),
+            escaped(&texts::alarm(&told.alarm, report.language))
+        )
     };
-    let heads = [Text::Raised, Text::Withdrawn, Text::CauseAndRemedy, Text::ClearedBy];
-    table(report, [Text::Alarms, Text::NoAlarm], "alarms", heads, report.story.alarms.iter().map(row))
+    let rows: String = report.story.alarms.iter().map(row).collect();
+    let heads = [Text::Raised, Text::Withdrawn, Text::ClearedBy];
+    let heads = heads.map(|head| format!("<th>{}</th>", report.say(head))).concat();
+    format!("<h2>{title}</h2>\n<table id=\"alarms\">\n<thead><tr>{heads}</tr></thead>\n{rows}</table>\n")
 }
 
 fn orders(report: &Report) -> String {
     let row = |order: &Order| {
         let record = &order.record;
-        [when(&record.utc), format!("{} at {}", record.actor, record.station), order.words(), order.answer()]
+        [
+            when(&record.utc),
+            format!("{} at {}", record.actor, record.station),
+            order.words(),
+            order.answer(report.language),
+        ]
     };
     let heads = [Text::Given, Text::By, Text::Order, Text::Answer];
     table(report, [Text::OrdersAndConfirmations, Text::NoOrder], "orders", heads, report.story.orders.iter().map(row))

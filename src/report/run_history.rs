@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::ReportError;
+use super::texts::ReportText as Text;
 use super::words::{gate_words, words};
 use regrind_cell::{
     Alarm, AlarmId, Command, Device, Ending, Event, Figures, GateResult, JobResult, Judgement, Reconciliation,
@@ -11,6 +12,7 @@ use regrind_cell::{
 };
 use regrind_formats::run_files::{CycleFile, CycleFolder};
 use regrind_journal::{Reader, Record, RecordKind, Verified, verify};
+use regrind_language::Language;
 use regrind_record::{
     Begin, Content, EventDetail, EventRecord, PartEnd, PassFigures, Remark, RunContent, RunEnd, TouchCounts,
 };
@@ -363,15 +365,13 @@ impl Order {
         words(&self.record)
     }
 
-    /// Returns the answer to this order of a person, as text: "accepted", or "refused: " and the reason. The text is
-    /// "on record" if the order went directly to a machine and not to the cell, because then later records show the
-    /// result.
-    pub(super) fn answer(&self) -> String {
+    /// Returns the answer to this order of a person: accepted, or refused with the reason. An order that went directly to
+    /// a machine and not to the cell has no answer of its own, because later records show its result.
+    pub(super) fn answer(&self, language: Language) -> String {
         match (&self.refused, &self.event) {
-            (Some(reason), _) => format!("refused: {reason}"),
-            (None, Some(_)) => "accepted".to_owned(),
-            // The order went to the machine; later records show the result.
-            (None, None) => "on record".to_owned(),
+            (Some(reason), _) => format!("{}: {reason}", Text::AnswerRefused.to(language)),
+            (None, Some(_)) => Text::AnswerAccepted.to(language).to_owned(),
+            (None, None) => Text::AnswerOnRecord.to(language).to_owned(),
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Texts of the report in all its languages. Sentences that the record has, such as the reason of a verdict, stay in the
 //! words of the record.
 
-use regrind_cell::{Alarm, Verdict};
+use regrind_cell::{Alarm, Role, Verdict};
 use regrind_language::Language;
 
 // The texts themselves are in the files of the languages.
@@ -28,13 +28,18 @@ regrind_language::texts! {
     VerifyHint Page
     // Details.
     Cell Machines Cycles Points Outliers Coverage Level Judged
-    OrdersAndConfirmations Raised Withdrawn NotWithdrawn CauseAndRemedy ClearedBy NoAlarm NoOrder Given By Order
+    OrdersAndConfirmations Raised Withdrawn NotWithdrawn ClearedBy NoAlarm NoOrder Given By Order
     Answer Identity HashOfLast Traceability NominalSurface
     Registration Fit Converged NotConverged Steps PointsUsed PointsOffPart SurfaceCovered Repeatability
     FrameUncertainty Remarks Shift Rotation Locked NotOnRecord OtherPoses Budget Source ShareOfRms ShareOfPv
     NotStated Combined SquaresAddUp SourceScatter SourceForm SourcePose SourceRadius SourceScales SourceSquareness
     SourceProbe SourceTemperature SourceDatum FormOfSurface RawLastCycle Unit Meaning RawAsMeasured FormNote
     UnlessStated WavesLeftOut Iso10110 Raw LastPass SphereRadius Touches WholePatterns
+    // A pass that broke off, measurements without figures, answers, and parameters of the machine.
+    PassStopped PassAborted PassFailed PassWithoutEnd ShareGround ShareNotKnown RestUnchanged RecordIncomplete
+    RunHasNotEnded NotJudged NotMeasured NoFigures ClearsItself ByOperator ByProcessEngineer AnswerAccepted
+    AnswerRefused AnswerOnRecord ParametersOfMachine Parameter EstimatedError Compensated CorrectionOfNextPass
+    ReducesRmsBy ErrorLeftForMap
 }
 
 /// Returns the word for a verdict.
@@ -51,6 +56,17 @@ pub(super) fn verdict(verdict: Verdict) -> Option<ReportText> {
         Verdict::Undecided => ReportText::Undecided,
         _ => return None,
     })
+}
+
+/// Returns the word for the people who can clear an alarm.
+pub(super) fn role(role: Role, language: Language) -> String {
+    let text = match role {
+        Role::Nobody => ReportText::ClearsItself,
+        Role::Operator => ReportText::ByOperator,
+        Role::ProcessEngineer => ReportText::ByProcessEngineer,
+        role => return super::words::recorded_name(&role),
+    };
+    text.to(language).to_owned()
 }
 
 /// Returns the text of an alarm: its event with the values of the case, its consequence and its remedy. English texts

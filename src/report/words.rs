@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use regrind_cell::{
     Alarm, Command, CompensationRefusal, ConnectionRefusal, Device, Ending, Event, Figures, GateFailure, GateResult,
-    Judgement, Occupation, Reconciliation, RecordFailure, Role,
+    Judgement, Occupation, Reconciliation, RecordFailure,
 };
 use regrind_figures::Interval;
 use regrind_formats::result::Coordinates;
@@ -168,7 +168,7 @@ fn spaced(name: &str) -> String {
 
 /// Returns the name with which `value` is recorded, as lower-case words. `value` is of a type that is recorded as a name,
 /// such as a verdict.
-fn recorded_name(value: &impl Serialize) -> String {
+pub(super) fn recorded_name(value: &impl Serialize) -> String {
     serde_json::to_value(value).ok().as_ref().and_then(|name| name.as_str()).map(spaced).unwrap_or_default()
 }
 
@@ -191,15 +191,6 @@ pub(super) fn verdict_words(judgement: &Judgement) -> String {
 /// Returns in one line the cause of an alarm, its consequence, and what to do.
 pub(super) fn alarm_words(alarm: &Alarm) -> String {
     format!("{} {} {}", alarm.event, alarm.consequence, alarm.remedy.join(" "))
-}
-
-/// Returns the role of the people who can clear an alarm, such as "process engineer". Returns "itself" if the alarm
-/// clears without an action of a person.
-pub(super) fn role_words(alarm: &Alarm) -> String {
-    match alarm.cleared_by {
-        Role::Nobody => "itself".to_owned(),
-        role => recorded_name(&role),
-    }
 }
 
 fn command_words(command: &Command) -> String {

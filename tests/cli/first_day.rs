@@ -56,6 +56,10 @@ fn accepted_part_is_named_when_it_is_made_again() {
     let (code, first, _) = make("SN-1");
     assert!(code == 0 && !first.contains("ACCEPTED before"), "{first}");
     let folder = run_folders(&home.path().join("runs")).remove(0);
+    if !cfg!(feature = "pdf") {
+        let (code, _, errors) = run(&["report", "--pdf"], home.path());
+        assert!(code == 2 && errors.contains("--features pdf"), "{errors}");
+    }
     let name = folder.file_name().unwrap().to_str().unwrap();
     assert!(first.contains(&format!("report   runs/{name}/report.html")), "{first}");
     let (_, again, _) = make("SN-1");

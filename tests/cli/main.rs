@@ -8,3 +8,5 @@ mod book;
 mod commands;
 mod first_day;
 mod recipe;
+#[cfg(feature = "pdf")]
+mod report_pdf;
