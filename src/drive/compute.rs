@@ -71,6 +71,7 @@ impl Drive {
             files = OutputFiles::new(folder.clone(), CycleFolder::Batch { cycle, batch: which }.to_string())
                 .with_final_subfolder(CycleFolder::Attempt { cycle, attempt: settled }.to_string());
         }
+        files = files.of_part(&self.context.serial);
         let computing = self.computations.executor.spawn_computation(&mut self.computations.running, move || {
             // A failure to create the folder shows as the error of the first file in it.
             let _ = create_folder(&files.folder());

@@ -187,22 +187,27 @@ pub(super) fn save_error_map(
     write_error_map(&files.add_file(CycleFile::ErrorMap), map, &origin, task.simulation)
         .and_then(|()| write_error_map_x3p(&files.add_file(CycleFile::ErrorMapX3p), map, &date, task.simulation))
         .map_err(classify_error)?;
-    save_pictures(task, files, map).and_then(|()| save_deviations(task, files, found)).map_err(classify_error)
+    save_pictures(task, files, number, map).and_then(|()| save_deviations(task, files, found)).map_err(classify_error)
 }
 
-fn save_pictures(task: &Task, files: &mut OutputFiles, map: &ErrorMap) -> Result<(), ReportError> {
-    let title =
-        if task.simulation { "Error of the part, filtered (SIMULATION)" } else { "Error of the part, filtered" };
-    let mut picture = HeatMap::of_lengths(title, "deviation", &map.nodes.samples_mm().collect::<Vec<_>>())?.of_nodes();
+/// Writes the error map as pictures, on the scale of the report.
+fn save_pictures(task: &Task, files: &mut OutputFiles, number: u32, map: &ErrorMap) -> Result<(), ReportError> {
+    let samples: Vec<[f64; 3]> = map.nodes.samples_mm().collect();
+    let identity = match files.serial() {
+        "" => task.part.clone(),
+        serial => format!("{}, serial {serial}", task.part),
+    };
+    let sign = "Red stands proud of the nominal surface, blue lies below it. The map is filtered.";
+    let mut picture = HeatMap::of_lengths(&format!("Error of form, cycle {number}"), "deviation", &samples)?
+        .of_nodes()
+        .with_round_limit()
+        .with_lines(vec![identity, sign.to_owned()])
+        .with_simulation(task.simulation);
     if let Some(outline) = task.nominal.outline() {
         picture = picture.within(outline);
     }
-    if let Some(tolerance_mm) = task.plot_tolerance_mm {
-        picture = picture.with_tolerance(tolerance_mm)?;
-    }
     picture.save_svg(&files.add_file(CycleFile::ErrorMapSvg))?;
-    let pixels = files.add_file(CycleFile::ErrorMapPng);
-    if task.simulation { picture.save_simulated_png(&pixels) } else { picture.save_png(&pixels) }
+    picture.save_png(&files.add_file(CycleFile::ErrorMapPng))
 }
 
 fn save_deviations(task: &Task, files: &mut OutputFiles, found: &Registration) -> Result<(), ReportError> {

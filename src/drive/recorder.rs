@@ -311,11 +311,22 @@ pub(super) struct OutputFiles {
     /// the folder of a batch of touches.
     final_subfolder: Option<String>,
     file_names: Vec<String>,
+    /// Serial number of the part; empty if it is not known.
+    serial: String,
 }
 
 impl OutputFiles {
     pub(super) fn new(run: PathBuf, below: String) -> Self {
-        Self { run_folder: run, subfolder: below, final_subfolder: None, file_names: Vec::new() }
+        Self { run_folder: run, subfolder: below, final_subfolder: None, file_names: Vec::new(), serial: String::new() }
+    }
+
+    /// Sets the serial number of the part, which pictures show.
+    pub(super) fn of_part(self, serial: &str) -> Self {
+        Self { serial: serial.to_owned(), ..self }
+    }
+
+    pub(super) fn serial(&self) -> &str {
+        &self.serial
     }
 
     /// Sets the subfolder for the final results of an adaptive measurement (targets are touched in batches until enough

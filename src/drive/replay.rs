@@ -369,9 +369,10 @@ impl<'t> Replay<'t> {
     /// `number`. Ignores files that are not recorded, and X3P files, which contain the time of writing. Returns an
     /// error for the first difference.
     fn compare_files(&self, number: u32, scratch: &Path, files: &OutputFiles) -> Result<(), ReplayError> {
-        // A file of this format contains the time of its writing.
-        let dated = |name: &str| name.ends_with(CycleFile::ErrorMapX3p.name());
-        for name in files.file_names().iter().filter(|name| !dated(name)) {
+        // A file in X3P contains the time of its writing. Pictures are drawn from the map, which is compared.
+        let derived = [CycleFile::ErrorMapX3p, CycleFile::ErrorMapSvg, CycleFile::ErrorMapPng].map(CycleFile::name);
+        let is_derived = |name: &str| derived.iter().any(|file| name.ends_with(file));
+        for name in files.file_names().iter().filter(|name| !is_derived(name)) {
             let path = scratch.join(name);
             let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
             let Some(recorded) = self.files.get(&(number, name.to_owned())) else { continue };

@@ -104,6 +104,17 @@ impl Ruler {
     }
 }
 
+/// Returns the smallest round number that is at least `limit`: 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6 or 8 times a power of
+/// ten. Neighbouring maps then often have the same scale. The page of a cell rounds in the same way.
+pub(super) fn round_limit(limit: f64) -> f64 {
+    if !(limit > 0.0 && limit.is_finite()) {
+        return 1.0;
+    }
+    let decade = 10f64.powf(limit.log10().floor());
+    let steps = [1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0];
+    steps.map(|step| step * decade).into_iter().find(|round| *round >= 0.999 * limit).unwrap_or(limit)
+}
+
 /// Returns the smallest step of 1, 2 or 5 times a power of ten that divides `extent` into at most `most` steps.
 fn nice_step(extent: f64, most: usize) -> f64 {
     let extent = if extent > 0.0 { extent } else { 1.0 };
@@ -200,6 +211,11 @@ mod tests {
         assert!((ruler.pixel(1.0) - 30.0).abs() < 1e-12);
         let flat = Ruler::new(Scale::Linear, [2.0, 2.0], [0.0, 1.0]).rounded(4);
         assert!(flat.range[0] < 2.0 && flat.range[1] > 2.0, "{:?}", flat.range);
+    }
+
+    #[test]
+    fn limits_are_round() {
+        assert_eq!([0.0, 4.2, 0.11, 20.0, 8.1, f64::NAN].map(round_limit), [1.0, 5.0, 0.12, 20.0, 10.0, 1.0]);
     }
 
     #[test]

@@ -11,10 +11,10 @@ use regrind_figures::statistics::rms;
 use regrind_formats::write_atomic;
 use regrind_language::{Language, localised};
 
-use super::axis::{Ruler, Scale, grouped, three_digits};
+use super::axis::{Ruler, Scale, grouped, round_limit, three_digits};
 use super::colour::{ColourMap, Tones};
+use super::pixels::drawn;
 use super::raster::Raster;
-use super::simulation_mark::mark_simulation;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
 use super::{ReportError, range};
 
@@ -45,6 +45,8 @@ pub struct HeatMap {
     max_size: [f64; 2],
     /// Samples with the lowest and the highest value: x, y, value.
     extremes: [[f64; 3]; 2],
+    /// True if the map is of a simulated part, so the figure is marked.
+    is_simulated: bool,
 }
 
 impl HeatMap {
@@ -73,6 +75,7 @@ impl HeatMap {
             figures_of: ["", "points"],
             max_size: [WIDTH, HEIGHT],
             extremes: extremes(samples),
+            is_simulated: false,
         };
         Ok(map.with_colours(ColourMap::Diverging))
     }
@@ -155,10 +158,22 @@ impl HeatMap {
         Ok(Self { tones: Tones::symmetric(limit, None), ..self })
     }
 
+    /// Sets the range of the colours to the first round number beyond the largest magnitude of the samples, as reports and
+    /// the page of a cell do. Always uses the diverging colour map. Removes a tolerance that was set before.
+    pub fn with_round_limit(self) -> Self {
+        let limit = round_limit(self.extremes[0][2].abs().max(self.extremes[1][2].abs()));
+        Self { tones: Tones::symmetric(limit, None), ..self }
+    }
+
     /// Sets the lines of text between the title and the summary line with PV and RMS. Replaces lines that were set
     /// before.
     pub fn with_lines(self, lines: Vec<String>) -> Self {
         Self { lines, ..self }
+    }
+
+    /// Sets whether the map is of a simulated part. The figure then has the mark SIMULATION in its upper right corner.
+    pub fn with_simulation(self, is_simulated: bool) -> Self {
+        Self { is_simulated, ..self }
     }
 
     /// Declares that the samples are nodes of a grid map and not measured points. The summary line below the title then
@@ -210,7 +225,7 @@ impl HeatMap {
     ///
     /// # Errors
     /// Fails if the PNG encoder returns an error.
-    pub fn to_png(&self) -> Result<Vec<u8>, ReportError> {
+    fn map_png(&self) -> Result<Vec<u8>, ReportError> {
         let mut palette = vec![0; 3];
         let [low, high] = self.tones.range;
         let value = |level: u8| low + (high - low) * f64::from(level) / f64::from(LEVELS - 1);
@@ -231,7 +246,11 @@ impl HeatMap {
             writer.finish()?;
             Ok(bytes)
         };
-        encoded().map_err(|source| ReportError::Encoding { figure: self.title.clone(), source })
+        encoded().map_err(|error: png::EncodingError| self.no_picture(error.to_string()))
+    }
+
+    fn no_picture(&self, reason: String) -> ReportError {
+        ReportError::Picture { figure: self.title.clone(), reason }
     }
 
     /// Returns the index of the colour of `value` in the palette of the PNG: 1 to 255 from the lower to the upper end
@@ -246,7 +265,7 @@ impl HeatMap {
     }
 
     /// Returns the complete figure as SVG: the map within axes in millimetres, a colour bar, the title, and lines of
-    /// text with PV and RMS.
+    /// text with PV and RMS. A map in diverging colours has a cross and the value at its lowest and its highest sample.
     ///
     /// # Errors
     /// Fails if the pixels cannot be encoded.
@@ -262,9 +281,15 @@ impl HeatMap {
         let pixel = width / self.raster.grid.columns as f64;
         // Few samples are shown as blocks. Many samples are smoothed when the figure is scaled.
         let rendering = if pixel > 4.0 { "pixelated" } else { "auto" };
-        svg.image(frame.corner, frame.size, &STANDARD.encode(self.to_png()?), rendering);
+        svg.image(frame.corner, frame.size, &STANDARD.encode(self.map_png()?), rendering);
         svg.frame(&frame);
         self.colour_bar(&mut svg, [left + width + 18.0, top], height, None);
+        if self.tones.colours == ColourMap::Diverging {
+            self.mark_extremes(&mut svg, &frame, Language::En);
+        }
+        if self.is_simulated {
+            svg.badge([left + width + BESIDE - 8.0, 24.0], "SIMULATION");
+        }
         Ok(svg.finish())
     }
 
@@ -275,22 +300,25 @@ impl HeatMap {
     /// Fails if the pixels cannot be encoded.
     pub fn to_plain_svg(&self, language: Language) -> Result<String, ReportError> {
         let frame = Frame { corner: [44.0, 8.0], x_label: "mm", y_label: "", ..self.frame_at([44.0, 8.0]) };
-        let ([left, top], [width, height], rulers) = (frame.corner, frame.size, self.rulers(frame.corner));
+        let ([left, top], [width, height]) = (frame.corner, frame.size);
         let mut svg = Svg::new(left + width + 74.0, top + height + 44.0);
-        svg.image(frame.corner, frame.size, &STANDARD.encode(self.to_png()?), "auto");
+        svg.image(frame.corner, frame.size, &STANDARD.encode(self.map_png()?), "auto");
         svg.frame(&frame);
         self.colour_bar(&mut svg, [left + width + 12.0, top], height, Some(language));
         svg.text([left + width + 12.0, top + height + 19.0], Anchor::Start, SMALL, &self.unit);
+        self.mark_extremes(&mut svg, &frame, language);
+        Ok(svg.finish())
+    }
+
+    /// Marks the lowest and the highest sample with a cross and the value. Numbers have the decimal sign of `language`.
+    fn mark_extremes(&self, svg: &mut Svg, frame: &Frame, language: Language) {
+        let ([left, _], [width, _], rulers) = (frame.corner, frame.size, self.rulers(frame.corner));
         for [x, y, value] in self.extremes {
             let at = [rulers[0].pixel(x), rulers[1].pixel(y)];
             let sign = if value < 0.0 { "\u{2212}" } else { "+" };
-            svg.cross(
-                at,
-                &format!("{sign}{}", localised(&three_digits(value.abs()), language)),
-                at[0] > left + 0.8 * width,
-            );
+            let text = format!("{sign}{}", localised(&three_digits(value.abs()), language));
+            svg.cross(at, &text, at[0] > left + 0.8 * width);
         }
-        Ok(svg.finish())
     }
 
     /// Returns the lines of text below the title. The last line is the summary, which contains the figures of the map
@@ -387,39 +415,13 @@ impl HeatMap {
         Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
     }
 
-    /// Saves the map alone, without axes and text, as a PNG file at `path`. Pixels without a value are transparent.
+    /// Saves the complete figure of [`HeatMap::save_svg`] as a PNG file at `path`, with one and a half times as
+    /// many pixels on each side.
     ///
     /// # Errors
-    /// Fails if the pixels cannot be encoded or if the file cannot be written.
+    /// Fails if the figure cannot be drawn or if the file cannot be written.
     pub fn save_png(&self, path: &Path) -> Result<(), ReportError> {
-        Ok(write_atomic(path, &self.to_png()?)?)
-    }
-
-    /// Saves the map alone, without axes and text, as a PNG file at `path`. Adds a strip above the map with the word
-    /// SIMULATION. If the map has too few pixels for the word, enlarges the map.
-    ///
-    /// # Errors
-    /// Fails if the image cannot be encoded or if the file cannot be written.
-    pub fn save_simulated_png(&self, path: &Path) -> Result<(), ReportError> {
-        let columns = self.raster.grid.columns;
-        let tone = |value: &f64| {
-            let [red, green, blue] = self.tones.at(*value);
-            if value.is_nan() { [0; 4] } else { [red, green, blue, 255] }
-        };
-        let pixels: Vec<[u8; 4]> = self.raster.values.chunks(columns).rev().flatten().map(tone).collect();
-        let picture = mark_simulation(&pixels, columns);
-        let encoded = || {
-            let mut bytes = Vec::new();
-            let mut encoder = png::Encoder::new(&mut bytes, picture.width as u32, picture.height as u32);
-            encoder.set_color(png::ColorType::Rgba);
-            encoder.set_depth(png::BitDepth::Eight);
-            encoder.set_compression(png::Compression::High);
-            let mut writer = encoder.write_header()?;
-            writer.write_image_data(&picture.rgba)?;
-            writer.finish()?;
-            Ok(bytes)
-        };
-        let bytes = encoded().map_err(|source| ReportError::Encoding { figure: self.title.clone(), source })?;
+        let bytes = drawn(&self.to_svg()?).map_err(|reason| self.no_picture(reason))?;
         Ok(write_atomic(path, &bytes)?)
     }
 }
@@ -477,7 +479,7 @@ mod tests {
         let map = HeatMap::of_lengths("known", "height", &SMALL_MAP).unwrap();
         assert_eq!((map.unit.as_str(), map.tones.range), ("µm", [-2.0, 2.0]));
         assert!((map.pv() - 4.0).abs() < 1e-12 && (map.rms() - (10f64 / 6.0).sqrt()).abs() < 1e-12);
-        let (info, pixels) = decoded(&map.to_png().unwrap());
+        let (info, pixels) = decoded(&map.map_png().unwrap());
         assert_eq!((info.width, info.height), (3, 2));
         let pixel = |i: usize, j: usize| <[u8; 4]>::try_from(&pixels[(j * 3 + i) * 4..][..4]).unwrap();
         // The first row of the picture is the row with the largest y.
@@ -491,7 +493,7 @@ mod tests {
     fn tolerance_band_tinted_and_labelled() {
         let map = HeatMap::of_lengths("band", "height", &SMALL_MAP).unwrap().with_tolerance(1.5e-3).unwrap();
         assert_eq!((map.limit(), map.tones.tolerance), (2.0, Some(1.5)));
-        let (_, pixels) = decoded(&map.to_png().unwrap());
+        let (_, pixels) = decoded(&map.map_png().unwrap());
         let pixel = |i: usize, j: usize| <[u8; 4]>::try_from(&pixels[(j * 3 + i) * 4..][..4]).unwrap();
         assert_eq!((pixel(0, 1), pixel(1, 1)), ([0x05, 0x30, 0x61, 255], [0xf7, 0xf7, 0xf7, 255]));
         assert!(pixel(0, 0)[..3].iter().all(|c| *c > 0xe0), "1 um is a tint: {:?}", pixel(0, 0));
@@ -565,7 +567,7 @@ mod tests {
             .collect();
         let map = HeatMap::of_lengths("ring", "height", &samples).unwrap();
         assert_eq!(map.unit, "nm");
-        let (info, pixels) = decoded(&map.to_png().unwrap());
+        let (info, pixels) = decoded(&map.map_png().unwrap());
         let alpha = |i: u32, j: u32| pixels[((j * info.width + i) * 4 + 3) as usize];
         assert_eq!([alpha(0, 0), alpha(info.width / 2, info.height / 2)], [0, 0]);
         assert_eq!(alpha(1, info.height / 2), 255);
@@ -583,7 +585,7 @@ mod tests {
         }
         let image = document.descendants().find(|n| n.has_tag_name("image")).unwrap();
         let data = image.attribute("href").unwrap().strip_prefix("data:image/png;base64,").unwrap();
-        assert_eq!(STANDARD.decode(data).unwrap(), map.to_png().unwrap());
+        assert_eq!(STANDARD.decode(data).unwrap(), map.map_png().unwrap());
     }
 
     #[test]

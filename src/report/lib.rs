@@ -21,11 +21,13 @@ mod convergence;
 mod dfq;
 mod equipment;
 mod first_page;
+mod fonts;
 mod form;
 mod heat_map;
 mod interval_bar;
 mod maps;
 mod pdf;
+mod pixels;
 mod plot;
 mod ply;
 mod qif;
@@ -37,7 +39,6 @@ mod results_file;
 mod run;
 mod run_history;
 mod shop_header;
-mod simulation_mark;
 mod states;
 mod summary;
 mod svg;
@@ -96,9 +97,9 @@ pub enum ReportError {
         "{figure}: a triangle uses point number {corner}, but the figure has only {points} points (the first point has number 0)"
     )]
     Corner { figure: String, corner: u32, points: usize },
-    /// Failure to encode the pixels as PNG.
-    #[error("{figure}: the figure could not be written as a PNG picture: {source}")]
-    Encoding { figure: String, source: png::EncodingError },
+    /// Failure to draw a figure or to encode its pixels as PNG.
+    #[error("{figure}: the figure could not be written as a PNG picture: {reason}")]
+    Picture { figure: String, reason: String },
     /// Run without results.
     #[error(
         "run {run}: no measurement of this run could be registered, so the run has no results to write; `regrind report` shows the reason"

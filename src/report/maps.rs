@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use super::axis::{Scale, fixed};
+use super::axis::{Scale, fixed, round_limit};
 use super::chart::{Chart, ChartAxis, Layer, Mark};
 use super::colour::ColourMap;
 use super::heat_map::HeatMap;
@@ -42,17 +42,6 @@ pub(super) fn read_maps(story: &RunHistory, folder: &Path) -> Result<Vec<CycleMa
         Ok(CycleMap { cycle, samples_um })
     };
     first.into_iter().chain(last).map(read).collect()
-}
-
-/// Returns the smallest round number that is at least `limit`: 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6 or 8 times a power of
-/// ten. Neighbouring maps then often have the same scale. The page of a cell rounds in the same way.
-fn round_limit(limit: f64) -> f64 {
-    if !(limit > 0.0 && limit.is_finite()) {
-        return 1.0;
-    }
-    let decade = 10f64.powf(limit.log10().floor());
-    let steps = [1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0];
-    steps.map(|step| step * decade).into_iter().find(|round| *round >= 0.999 * limit).unwrap_or(limit)
 }
 
 impl CycleMap {
@@ -184,8 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn limits_are_round() {
-        assert_eq!([0.0, 4.2, 0.11, 20.0, 8.1, f64::NAN].map(round_limit), [1.0, 5.0, 0.12, 20.0, 10.0, 1.0]);
+    fn own_limit_is_round() {
         assert_eq!(map().own_limit_um(), 5.0);
     }
 

@@ -129,6 +129,20 @@ impl Svg {
         ));
     }
 
+    /// Draws a text in a frame. `[x, y]` is the right end of its base line.
+    pub(super) fn badge(&mut self, [x, y]: [f64; 2], content: &str) {
+        // Bold capitals are about this wide.
+        let width = 8.6 * content.chars().count() as f64 + 12.0;
+        let content = escaped(content);
+        self.put(format_args!(
+            "<rect x=\"{:.2}\" y=\"{:.2}\" width=\"{width:.2}\" height=\"20\" rx=\"4\" fill=\"none\" stroke=\"{INK}\" stroke-width=\"1.5\"/>\n\
+             <text x=\"{:.2}\" y=\"{y:.2}\" text-anchor=\"middle\" font-weight=\"600\">{content}</text>\n",
+            x - width,
+            y - 14.5,
+            x - width / 2.0
+        ));
+    }
+
     /// Draws a cross at `[x, y]` with a text beside it, both on a white edge so that they are seen on any colour. The text
     /// is to the left of the cross if `is_left` is true.
     pub(super) fn cross(&mut self, [x, y]: [f64; 2], content: &str, is_left: bool) {

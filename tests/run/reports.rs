@@ -8,6 +8,7 @@ use regrind::cell::{
     Actor, AlarmId, Command, Ending, Event, Figures, GateFailure, GateResult, Judgement, Phase, State, Tolerance,
     Verdict, sample_events,
 };
+use regrind::formats::read_error_map;
 use regrind::journal::{Entry, Header, Journal, Reader, RecordKind};
 use regrind::report::{ReportOptions, run_report, write_run_report};
 use serde_json::{Value, json};
@@ -101,6 +102,37 @@ fn shown(folder: &Path) -> Vec<(String, String)> {
     out.lines().skip(2).filter_map(row).collect()
 }
 
+/// The pictures of a map name the part, the cycle, the sign, the unit and the extremes, and are marked as a simulation.
+fn map_pictures_can_stand_alone(folder: &Path, last: usize) {
+    let svg = fs::read_to_string(folder.join(format!("cycle-{last}/error_map.svg"))).unwrap();
+    let [low, high] = read_error_map(&folder.join(format!("cycle-{last}/error_map.csv"))).unwrap().iter().fold(
+        [f64::INFINITY, f64::NEG_INFINITY],
+        |[low, high], node| {
+            let [.., error_mm] = node.error();
+            [low.min(error_mm), high.max(error_mm)]
+        },
+    );
+    let three_digits = |um: f64| format!("{um:.*}", if um < 1.0 { 3 } else { 2 - usize::from(um >= 10.0) });
+    let extremes = [format!(">\u{2212}{}<", three_digits(-1e3 * low)), format!(">+{}<", three_digits(1e3 * high))];
+    let title = format!(">Error of form, cycle {last}<");
+    let words = [
+        &title,
+        "free-form mirror, serial SN 12<",
+        "Red stands proud",
+        "deviation / \u{b5}m",
+        "x / mm",
+        ">SIMULATION<",
+    ];
+    for words in words.into_iter().chain(extremes.iter().map(String::as_str)) {
+        assert!(svg.contains(words), "{words}: {svg}");
+    }
+    // The picture in pixels is the same one: its header has the width and height.
+    let png = fs::read(folder.join(format!("cycle-{last}/error_map.png"))).unwrap();
+    let length = |at: usize| f64::from(u32::from_be_bytes(png[at..at + 4].try_into().unwrap()));
+    let of_svg = |key: &str| svg.split(key).nth(1).unwrap().split('"').next().unwrap().parse::<f64>().unwrap();
+    assert_eq!([length(16), length(20)], [" width=\"", " height=\""].map(|key| (1.5 * of_svg(key)).ceil()));
+}
+
 #[test]
 fn report_of_accepted_run_matches_result() {
     let home = tempfile::tempdir().unwrap();
@@ -130,6 +162,7 @@ fn report_of_accepted_run_matches_result() {
         }
     }
     assert!(page.says("No alarm was raised."));
+    map_pictures_can_stand_alone(&folder, cycles.len());
     means_registration_and_signatures(&page, &folder, cycles.len());
     let orders = page.rows("orders");
     assert!(orders[0][1].starts_with("Ada at ") && orders[0][2] == "start", "{orders:?}");

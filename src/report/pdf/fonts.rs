@@ -4,8 +4,7 @@ use typst::foundations::Bytes;
 use typst::text::{Font, FontBook};
 use typst_kit::fonts::{FontSearcher, FontSlot};
 
-/// Inter, reduced to the Latin, Greek and Cyrillic letters and to the signs of a report.
-const OWN: [&[u8]; 2] = [include_bytes!("../fonts/Inter-Regular.otf"), include_bytes!("../fonts/Inter-SemiBold.otf")];
+use super::super::fonts::{FAMILY, FILES, have_all};
 
 /// Families of fonts for other characters, the preferred ones first.
 const OTHERS: [&str; 7] = [
@@ -30,11 +29,10 @@ impl Fonts {
     /// Returns the fonts for a text. The fonts of the computer are read only if the fonts of this program lack one of the
     /// characters.
     pub(super) fn with_characters_of(text: &str) -> Self {
-        let own: Vec<Font> = OWN.iter().filter_map(|bytes| Font::new(Bytes::new(*bytes), 0)).collect();
+        let own: Vec<Font> = FILES.iter().filter_map(|bytes| Font::new(Bytes::new(*bytes), 0)).collect();
         let mut book = FontBook::from_fonts(&own);
-        let has = |c: char| own.iter().all(|font| font.info().coverage.contains(u32::from(c)));
         let mut of_computer = Vec::new();
-        if !text.chars().filter(|c| !c.is_control()).all(has) {
+        if !have_all(text) {
             let found = FontSearcher::new().search();
             for k in 0..found.fonts.len() {
                 if let Some(info) = found.book.info(k) {
@@ -49,7 +47,7 @@ impl Fonts {
     /// Returns the names of the families, the preferred ones first.
     pub(super) fn families(&self) -> Vec<&'static str> {
         let others = OTHERS.iter().copied().filter(|name| self.book.contains_family(&name.to_lowercase()));
-        std::iter::once("Inter").chain(others).collect()
+        std::iter::once(FAMILY).chain(others).collect()
     }
 
     /// Returns the font with an index.
