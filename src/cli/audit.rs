@@ -10,7 +10,7 @@ use regrind::journal::{
     Anchor, DATABASE, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Verified, verify_against,
 };
 use regrind::record::{Begin, RunContent, begin_of};
-use regrind::report::{Paper, ReportOptions, report_options, run_report, run_report_pdf, words};
+use regrind::report::{Paper, ReportOptions, report_options, run_label, run_report, run_report_pdf, words};
 use serde_json::json;
 
 use super::Outcome;
@@ -223,7 +223,8 @@ fn is_folder_of_runs(folder: &Path) -> bool {
 /// the names of these files. A report is named only if it differs from the report that is made from the journal now.
 /// Returns an empty text if there is nothing to report.
 fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
-    let [html, pdf] = [RunFile::Report, RunFile::PdfReport].map(RunFile::name);
+    let made = [RunFile::Report, RunFile::PdfReport, RunFile::Label].map(RunFile::name);
+    let [html, pdf, label] = made;
     let text = std::fs::read_to_string(folder.join(html)).unwrap_or_default();
     let options = report_options(&text).unwrap_or_default();
     // The header of a shop is in the file of the report alone, so anybody can change it.
@@ -237,10 +238,14 @@ fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     if has(html) && run_report(folder, &options).ok().as_ref() != Some(&text) {
         lines += &changed_report(html, "");
     }
+    let written = std::fs::read_to_string(folder.join(label)).ok();
+    if has(label) && run_label(folder, &options).ok() != written {
+        lines += &changed_report(label, "");
+    }
     if has(pdf) {
         lines += &pdf_text(folder, pdf, &options);
     }
-    let others: Vec<&str> = unrecorded.iter().map(String::as_str).filter(|name| ![html, pdf].contains(name)).collect();
+    let others: Vec<&str> = unrecorded.iter().map(String::as_str).filter(|name| !made.contains(name)).collect();
     match others.len() {
         0 => lines,
         _ => format!("{lines}files       not in the record, so not verified: {}\n", others.join(", ")),

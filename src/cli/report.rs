@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use regrind::report::{
-    Language, MAX_LOGO_BYTES, Paper, ReportOptions, ResultsFormat, ShopHeader, logo_uri, write_run_report,
-    write_run_report_pdf, write_run_results,
+    Language, MAX_LOGO_BYTES, Paper, ReportOptions, ResultsFormat, ShopHeader, logo_uri, write_run_label,
+    write_run_report, write_run_report_pdf, write_run_results,
 };
 
 use super::Outcome;
@@ -45,6 +45,9 @@ pub(super) struct Arguments {
     /// Size of the pages of the PDF: a4 or letter
     #[arg(long, value_name = "SIZE", default_value = "a4", value_parser = paper)]
     paper: Paper,
+    /// Also write a label of 80 mm by 30 mm with serial number, verdict and a QR code, to FILE or to RUN/label.svg
+    #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
+    label: Option<Option<PathBuf>>,
     /// Also write the results as QIF 3.0, to FILE or to RUN/results.qif
     #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
     qif: Option<Option<PathBuf>>,
@@ -109,6 +112,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     if let Some(path) = &arguments.pdf {
         let pdf = write_run_report_pdf(&folder, &options, arguments.paper, path.as_deref()).map_err(Failure::Report)?;
         written.push(("pdf", pdf));
+    }
+    if let Some(path) = &arguments.label {
+        written.push(("label", write_run_label(&folder, &options, path.as_deref()).map_err(Failure::Report)?));
     }
     let wanted = [("qif", ResultsFormat::Qif, &arguments.qif), ("dfq", ResultsFormat::Dfq, &arguments.dfq)];
     for (key, format, path) in wanted {

@@ -53,6 +53,8 @@ named_files! {
         Report = "report.html",
         /// Report of the run as PDF/A.
         PdfReport = "report.pdf",
+        /// Label of the part.
+        Label = "label.svg",
         /// Results of the run as QIF 3.0.
         QifResults = "results.qif",
         /// Results of the run as Q-DAS ASCII.
@@ -212,7 +214,7 @@ mod tests {
         let names: Vec<&str> = RunFile::ALL.iter().map(|file| file.name()).collect();
         assert_eq!(
             names.join(" "),
-            "recipe.toml cell.toml learned_from.json learned.json result.json report.html report.pdf results.qif results.dfq control.sock"
+            "recipe.toml cell.toml learned_from.json learned.json result.json report.html report.pdf label.svg results.qif results.dfq control.sock"
         );
         let names: Vec<&str> = CycleFile::ALL.iter().map(|file| file.name()).collect();
         assert_eq!(

@@ -70,7 +70,7 @@ fn head(report: &Report) -> String {
 }
 
 /// Returns how the run ended: the class of the box, its word, the reason, and true if the end is good.
-fn outcome(report: &Report) -> (&'static str, Text, String, bool) {
+pub(super) fn outcome(report: &Report) -> (&'static str, Text, String, bool) {
     match (&report.story.ending, report.story.home) {
         (Some(ending), _) => {
             let (class, text) = match ending {

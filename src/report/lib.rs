@@ -25,6 +25,7 @@ mod fonts;
 mod form;
 mod heat_map;
 mod interval_bar;
+mod label;
 mod maps;
 mod pdf;
 mod pixels;
@@ -54,6 +55,7 @@ pub use colour::ColourMap;
 pub use dfq::{DfqPart, dfq_of_parts};
 pub use heat_map::HeatMap;
 pub use interval_bar::interval_bar;
+pub use label::{run_label, write_run_label};
 pub use pdf::{Paper, run_report_pdf, write_run_report_pdf};
 pub use plot::{Axis, Plot, Series};
 pub use ply::{coloured_ply, save_coloured_ply};
@@ -105,6 +107,11 @@ pub enum ReportError {
         "run {run}: no measurement of this run could be registered, so the run has no results to write; `regrind report` shows the reason"
     )]
     NothingMeasured { run: String },
+    /// Label whose texts do not fit into a code.
+    #[error(
+        "run {run}: the label cannot be written, because its texts do not fit into a QR code: {reason}; use a shorter serial number"
+    )]
+    Label { run: String, reason: String },
     /// Report that cannot be laid out as PDF.
     #[error("run {run}: the report cannot be written as PDF: {reason}; the HTML report has the same content")]
     Pdf { run: String, reason: String },

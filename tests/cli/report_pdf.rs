@@ -1,4 +1,4 @@
-//! PDF of a report, read by foreign readers: qpdf, pikepdf, and the programs of Poppler.
+//! PDF of a report and label of a part, read by foreign readers: qpdf, pikepdf, the programs of Poppler, and zbar.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -20,7 +20,7 @@ fn made_part(home: &Path) -> PathBuf {
 /// Runs a foreign program on a file, and returns what it prints.
 fn foreign(program: &str, arguments: &[&str], file: &Path) -> String {
     let output = Command::new(program).args(arguments).arg(file).output().unwrap_or_else(|error| {
-        panic!("{program}: {error}; the Debian packages qpdf, poppler-utils and python3-pikepdf have the readers")
+        panic!("{program}: {error}; the readers are in the Debian packages qpdf, poppler-utils, python3-pikepdf, librsvg2-bin and zbar-tools")
     });
     let said = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(output.status.success(), "{program}: {said}{}", String::from_utf8_lossy(&output.stderr));
@@ -111,6 +111,24 @@ fn assert_pages(pages: &[String], folder: &Path) {
     for (k, page) in pages.iter().enumerate() {
         assert!(page.contains(&format!("SN-7 \u{b7} SIMULATION \u{b7} page {} of {}", k + 1, pages.len())), "{page}");
     }
+}
+
+/// Another program reads the code of the label, drawn as a printer with 300 dots an inch would print it.
+#[test]
+fn code_of_label_has_serial_run_and_head() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e5).display().to_string();
+    assert_eq!(run(&["run", &recipe, "--part", "Linse Ø40/7"], home.path()).0, 0);
+    assert_eq!(run(&["report", "--label"], home.path()).0, 0);
+    let folder = run_folders(&home.path().join("runs")).remove(0);
+    let printed = home.path().join("label.png");
+    let out = printed.to_str().unwrap();
+    foreign("rsvg-convert", &["--dpi-x", "300", "--dpi-y", "300", "--output", out], &folder.join("label.svg"));
+    let read = foreign("zbarimg", &["--quiet", "--raw"], &printed);
+    let (code, verified, _) = run(&["audit", "verify", "--json"], home.path());
+    let head = serde_json::from_str::<Value>(&verified).unwrap()["head"].clone();
+    let name = folder.file_name().unwrap().to_str().unwrap();
+    assert_eq!((code, read), (0, format!("Linse Ø40/7\n{name}\n{}\n", head.as_str().unwrap())));
 }
 
 #[test]
