@@ -9,6 +9,7 @@ use regrind::device::{AnyCmm, AnyGrinder, MachineKind};
 use regrind::drive::{BlockingExecutor, Drive, InterruptedRun, JournalSink, OrderSender, Request, RunInputs, Task};
 use regrind::journal::{Journal, MachineLock};
 use regrind::recipe::Recipe;
+use regrind::report::ending_words;
 use regrind::setup;
 use regrind_control::NextStep;
 use tokio::sync::mpsc;
@@ -16,7 +17,7 @@ use tokio::sync::mpsc;
 use super::Outcome;
 use super::failure::Failure;
 use super::outside::{self, Endings};
-use super::show::{Show, reads_keys};
+use super::show::{Show, print_end, reads_keys};
 
 /// Context of a run.
 pub(super) struct RunContext<'a> {
@@ -98,8 +99,8 @@ impl RunContext<'_> {
         let report = regrind::report::write_run_report(self.folder, &regrind::report::ReportOptions::default());
         shown??;
         match report {
-            Err(error) => super::print(&format!("the report was not written: {error}\n"))?,
-            Ok(path) if !self.json => super::print(&format!("report   {}\n", path.display()))?,
+            Err(error) => super::print(&format!("{}\nthe report was not written: {error}\n", ending_words(&ending)))?,
+            Ok(path) if !self.json => print_end(self.folder, &ending, &path)?,
             Ok(_) => {}
         }
         Ok(ending)

@@ -7,14 +7,17 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, FurtherTouches, Judgement, PvPoints, Tolerance};
+use regrind::cell::{
+    Alarm, AlarmId, ComparedFigure, CompensationSummary, Device, Ending, Figures, FurtherTouches, Judgement, PvPoints,
+    Tolerance, Verdict,
+};
 use regrind::document::visible;
 use regrind::drive::{CycleRow, Notice, PreviewStatistics};
 use regrind::formats::read_error_map;
 use regrind::formats::run_files::{CycleFile, CycleFolder};
 use regrind::model::FIRST_BATCH;
 use regrind::recipe::{Recipe, SelectionMode};
-use regrind::report::in_air;
+use regrind::report::{Language, ending_words, first_lines, in_air, verdict_in_words};
 use tokio::sync::mpsc;
 
 use super::blocks::{Blocks, sparkline};
@@ -22,8 +25,10 @@ use super::failure::Failure;
 use super::outside::is_in_front;
 use super::words::{judged, three_digits, time_left, wrapped};
 
-/// Minimum time between two lines about the progress of the same job.
-const QUIET: Duration = Duration::from_secs(2);
+/// Minimum time between two lines about the progress of the same job. A short job has one line.
+const QUIET: Duration = Duration::from_secs(60);
+/// Number of columns of the complete table of cycles. A narrower terminal gets a table with fewer columns.
+const TABLE: usize = 80;
 
 /// Display of a run.
 pub(super) struct Show {
@@ -38,11 +43,23 @@ pub(super) struct Show {
     bar: Option<ProgressBar>,
     /// Time of the last plain line about progress.
     said: Option<Instant>,
-    job: Option<(Device, u32)>,
+    job: Option<Job>,
+    /// Figures of the measurement that is not yet judged.
+    measured: Option<(u32, Figures)>,
+    /// Cycles that have a row in the table so far.
+    rows: Vec<u32>,
     /// Texts of the active alarms that were shown.
     alarms: HashMap<AlarmId, String>,
     /// RMS of each cycle.
     rms_mm: Vec<f64>,
+}
+
+/// Job of a machine that reports its progress.
+struct Job {
+    device: Device,
+    cycle: u32,
+    total: u32,
+    began: Instant,
 }
 
 impl Show {
@@ -57,6 +74,8 @@ impl Show {
             bar: (!json && io::stderr().is_terminal()).then(bar),
             said: None,
             job: None,
+            measured: None,
+            rows: Vec::new(),
             alarms: HashMap::new(),
             rms_mm: Vec::new(),
         }
@@ -97,6 +116,9 @@ impl Show {
                 self.progress((*device, *cycle), *done, *total, *remaining_s)
             }
             Notice::State { state, cycle, event, has_progress: at_job } => {
+                if !at_job {
+                    self.end_job()?;
+                }
                 if let Some(bar) = &self.bar {
                     // The bar of a job ends with the job.
                     if !at_job {
@@ -125,25 +147,8 @@ impl Show {
                 messages.iter().try_for_each(|message| self.line(&format!("{device}: {message}")))
             }
             Notice::Figures { cycle, figures } => self.figures(*cycle, figures),
-            Notice::Judged(Judgement { cycle, reason, .. }) => self.line(&format!("cycle {cycle}: {reason}")),
-            Notice::Compensated { cycle, summary } => {
-                self.line(&format!(
-                    "cycle {cycle}: next pass corrects up to {} µm, depth {} µm, {}, gain {}; expected PV {} µm, RMS {} µm",
-                    three_digits(1e3 * summary.max_correction_mm),
-                    three_digits(1e3 * summary.depth_mm),
-                    in_air(summary.air_share),
-                    gains(&summary.gains),
-                    three_digits(1e3 * summary.predicted_pv_mm),
-                    three_digits(1e3 * summary.predicted_rms_mm)
-                ))?;
-                for told in &summary.parameters {
-                    self.line(&format!("cycle {cycle}: {}", told.in_words()))?;
-                }
-                if let Some(mm) = summary.map_rms_mm {
-                    self.line(&format!("cycle {cycle}: error that the correction map must correct: {} µm RMS", three_digits(1e3 * mm)))?;
-                }
-                summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
-            }
+            Notice::Judged(judgement) => self.judgement(judgement),
+            Notice::Compensated { cycle, summary } => self.compensated(*cycle, summary),
             // The record contains every repetition, but a person needs to see the alarm only once.
             Notice::Alarm(alarm) if self.alarms.get(&alarm.id) == Some(&alarm.event) => Ok(()),
             Notice::Alarm(alarm) => {
@@ -156,8 +161,30 @@ impl Show {
             }
             Notice::Refused { reason } => self.line(&format!("refused: {reason}")),
             Notice::RecordFailed { message } => self.line(&format!("RECORD: {message}")),
-            Notice::Finished { ending, cycles, touches } => self.finished(ending, cycles, *touches),
+            Notice::Finished { cycles, touches, .. } => self.finished(cycles, *touches),
         }
+    }
+
+    fn compensated(&self, cycle: u32, summary: &CompensationSummary) -> Result<(), Failure> {
+        self.line(&format!(
+            "cycle {cycle}: next pass corrects up to {} µm, depth {} µm, {}, gain {}; expected PV {} µm, RMS {} µm",
+            three_digits(1e3 * summary.max_correction_mm),
+            three_digits(1e3 * summary.depth_mm),
+            in_air(summary.air_share),
+            gains(&summary.gains),
+            three_digits(1e3 * summary.predicted_pv_mm),
+            three_digits(1e3 * summary.predicted_rms_mm)
+        ))?;
+        for told in &summary.parameters {
+            self.line(&format!("cycle {cycle}: {}", told.in_words()))?;
+        }
+        if let Some(mm) = summary.map_rms_mm {
+            self.line(&format!(
+                "cycle {cycle}: error that the correction map must correct: {} µm RMS",
+                three_digits(1e3 * mm)
+            ))?;
+        }
+        summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
     }
 
     /// Prints a line about an order that the cell has accepted, and the effect of this order. `event` is the name of
@@ -175,26 +202,39 @@ impl Show {
         }
     }
 
+    /// Shows the progress of a job: on a terminal as a bar, elsewhere as a line at its begin and after each minute.
     fn progress(&mut self, job: (Device, u32), done: u32, total: u32, left_s: Option<[f64; 2]>) -> Result<(), Failure> {
         let (device, cycle) = job;
         let left = left_s.map_or(String::new(), |left_s| format!(", {} left", time_left(left_s)));
-        let is_new = self.job.replace(job) != Some(job);
+        let is_new = self.job.as_ref().is_none_or(|known| (known.device, known.cycle) != job);
+        if is_new {
+            self.end_job()?;
+            self.job = Some(Job { device, cycle, total, began: Instant::now() });
+        }
         if let Some(bar) = &self.bar {
             bar.set_style(style("{wide_msg} [{bar:16}] {percent:>3} %"));
             bar.set_length(u64::from(total));
             bar.set_position(u64::from(done));
-            bar.set_message(format!("cycle {cycle}  {}{left}", doing(device)));
+            bar.set_message(format!("cycle {cycle}: {}{left}", doing(device)));
         } else if is_new || self.said.is_none_or(|at| at.elapsed() >= QUIET) {
             self.said = Some(Instant::now());
-            self.line(&format!("cycle {cycle}: {}{left}", how_far(device, done, total)))?;
+            let words = if is_new { whole_job(device, total) } else { how_far(device, done, total) };
+            self.line(&format!("cycle {cycle}: {words}{left}"))?;
         }
         Ok(())
+    }
+
+    /// Leaves a line about the job that is over, where a bar has shown its progress.
+    fn end_job(&mut self) -> Result<(), Failure> {
+        let (Some(Job { device, cycle, total, began }), Some(_)) = (self.job.take(), &self.bar) else { return Ok(()) };
+        let seconds = began.elapsed().as_secs_f64();
+        self.line(&format!("cycle {cycle}: {}, {}", whole_job(device, total), time_left([seconds, seconds])))
     }
 
     fn figures(&mut self, cycle: u32, figures: &Figures) -> Result<(), Failure> {
         let compared = self.tolerance.compare(figures);
         let [pv, rms] = compared.map(|compared| judged(&compared));
-        let (points, outliers) = (figures.points, figures.outliers);
+        let points = figures.points;
         if let Some(FurtherTouches { target_count: targets, reason }) = figures.further_touches.as_deref() {
             // The first touches only show that they belong to this part.
             let known = figures
@@ -204,14 +244,56 @@ impl Show {
             self.line(&format!("cycle {cycle}: {known}{points} points measured; {targets} more follow: {reason}"))?;
             return self.picture(cycle);
         }
-        // The judgement follows, with the figures and their limits.
-        let mut text = format!("cycle {cycle}: {points} points, {outliers} outliers");
         for words in figures.weak_directions.iter().chain(&figures.warnings) {
-            let _ = write!(text, "\n         {words}");
+            self.line(&format!("cycle {cycle}: {words}"))?;
         }
-        self.line(&text)?;
         self.rms_mm.push(compared[1].median_mm);
+        self.measured = Some((cycle, figures.clone()));
         self.picture(cycle)
+    }
+
+    /// Prints the row of a judged cycle in the table of cycles. Prints also the reason of the judgement, unless the
+    /// figures alone say it.
+    fn judgement(&mut self, judgement: &Judgement) -> Result<(), Failure> {
+        let Judgement { cycle, verdict, reason } = judgement;
+        let decision = verdict_in_words(*verdict, Language::En);
+        if let Some((_, figures)) = self.measured.take().filter(|(of, _)| of == cycle) {
+            let compared = self.tolerance.compare(&figures);
+            let with_u = |of: &ComparedFigure, digits: usize| {
+                [of.median_mm, of.expanded_mm].map(|mm| format!("{:.digits$}", 1e3 * mm))
+            };
+            let values = [with_u(&compared[0], 2), with_u(&compared[1], 3)];
+            self.row(*cycle, values, figures.points, figures.outliers, &decision)?;
+        }
+        if matches!(verdict, Verdict::Accept | Verdict::Continue) {
+            return Ok(());
+        }
+        self.line(&format!("cycle {cycle}: {decision}: {reason}"))
+    }
+
+    /// Prints a row of the table of cycles, and its head before the first row. `values` are PV and RMS, each with its
+    /// expanded uncertainty or an empty text.
+    fn row(
+        &mut self,
+        cycle: u32,
+        values: [[String; 2]; 2],
+        points: u32,
+        outliers: u32,
+        decision: &str,
+    ) -> Result<(), Failure> {
+        let is_narrow = self.bar.is_some() && columns() < TABLE;
+        let line = |cycle: &str, pv: &str, rms: &str, points: &str, outliers: &str, decision: &str| match is_narrow {
+            true => format!("{cycle:>5}  {pv:>14}  {rms:>15}  {decision}"),
+            false => format!("{cycle:>5}  {pv:>15}  {rms:>17}  {points:>8}  {outliers:>8}  {decision}"),
+        };
+        if self.rows.is_empty() {
+            let pv = format!("{} µm", pv_name(&self.tolerance));
+            self.line(&line("cycle", &pv, "RMS µm", "points", "outliers", "decision"))?;
+        }
+        self.rows.push(cycle);
+        let [pv, rms] = values.map(|[value, u]| if u.is_empty() { value } else { format!("{value} \u{b1} {u}") });
+        let row = line(&cycle.to_string(), &pv, &rms, &points.to_string(), &outliers.to_string(), decision);
+        self.line(row.trim_end())
     }
 
     /// Prints the error map of the cycle `cycle` in colour, and a small chart of the RMS values of all cycles so far.
@@ -220,8 +302,10 @@ impl Show {
     fn picture(&self, cycle: u32) -> Result<(), Failure> {
         let (Some(bar), true) = (&self.bar, console::colors_enabled()) else { return Ok(()) };
         let nodes = newest_map(Path::new(&self.folder), cycle).and_then(|path| read_error_map(&path).ok());
-        let columns = console::Term::stdout().size_checked().map_or(60, |(_, columns)| usize::from(columns));
         let Some(nodes) = nodes else { return Ok(()) };
+        // The rows above and below the map stay on the screen.
+        let height = console::Term::stdout().size_checked().map_or(16, |(rows, _)| usize::from(rows).saturating_sub(8));
+        let height = height.clamp(8, 24);
         let falls = match &self.rms_mm[..] {
             [] => String::new(),
             rms_mm => format!("RMS {}\n", sparkline(rms_mm.iter().copied())),
@@ -230,7 +314,7 @@ impl Show {
         let (blocks, below) = if self.is_chosen {
             // For chosen touches, the map of the error and the map of its standard deviation are shown side by side.
             const APART: usize = 2;
-            let room = [(columns.min(110) - 4 - APART) / 2, 16];
+            let room = [columns().saturating_sub(2 + APART) / 2, height];
             let both = Blocks::paint_error(&nodes, room).zip(Blocks::paint_sigma(&nodes, room));
             let Some((blocks, sigma)) = both else { return Ok(()) };
             let wide = blocks.rows.first().map_or(0, Vec::len) + APART;
@@ -238,7 +322,9 @@ impl Show {
             let below = format!("{:wide$}{known}\n{falls}", error(&blocks));
             (blocks.append_right(sigma, APART), below)
         } else {
-            let Some(blocks) = Blocks::paint_error(&nodes, [columns.min(72) - 4, 16]) else { return Ok(()) };
+            let Some(blocks) = Blocks::paint_error(&nodes, [columns().saturating_sub(2), height]) else {
+                return Ok(());
+            };
             let below = format!("{}   {falls}", error(&blocks));
             (blocks, below)
         };
@@ -253,50 +339,68 @@ impl Show {
         self.striking(&text, "ALARM", "31")
     }
 
-    fn finished(&mut self, ending: &Ending, cycles: &[CycleRow], touches: Option<[usize; 2]>) -> Result<(), Failure> {
-        let (word, reason) = match ending {
-            Ending::Accepted { reason, .. } => ("ACCEPTED", reason),
-            Ending::NotAccepted { reason, .. } => ("NOT ACCEPTED", reason),
-            Ending::Stopped { reason, .. } => ("STOPPED", reason),
-            Ending::Aborted { reason, .. } => ("ABORTED", reason),
-        };
-        let mut text = String::new();
-        if !cycles.is_empty() {
-            let pv = format!("{} µm", pv_name(&self.tolerance));
-            let _ = writeln!(text, "\ncycle {pv:>13}   RMS µm   points  outliers  level µm");
-        }
-        for row in cycles {
-            let CycleRow { cycle, points, outliers, level_um, .. } = row;
+    /// Prints the rows of the cycles that were judged before this program followed the run, and the number of touches.
+    fn finished(&mut self, cycles: &[CycleRow], touches: Option<[usize; 2]>) -> Result<(), Failure> {
+        for row in cycles.iter().filter(|row| !self.rows.contains(&row.cycle)).cloned().collect::<Vec<_>>() {
             let [pv_um, rms_um] = row.judged_um();
-            let _ = writeln!(text, "{cycle:>5} {pv_um:>13.2} {rms_um:>8.3} {points:>8} {outliers:>9} {level_um:>9.1}");
+            let values = [[format!("{pv_um:.2}"), String::new()], [format!("{rms_um:.3}"), String::new()]];
+            self.row(row.cycle, values, row.points, row.outliers, "")?;
         }
-        if let Some([taken, whole]) = touches {
-            let _ = writeln!(text, "\n{taken} touches on the part, instead of {whole} with the complete pattern");
-        }
-        let marked = if self.simulated { "SIMULATION  " } else { "" };
-        let _ = write!(text, "\n{marked}{word}: {reason}");
-        self.striking(&text, word, if word == "ACCEPTED" { "32" } else { "31" })
+        let Some([taken, whole]) = touches else { return Ok(()) };
+        self.line(&format!("{taken} touches on the part, instead of {whole} with the complete pattern"))
     }
 
     fn line(&self, text: &str) -> Result<(), Failure> {
         self.striking(text, "", "")
     }
 
-    /// Prints `text`. If there is a terminal and `word` is not empty, also rings the bell, and shows the first
-    /// occurrence of `word` in colour if the terminal supports colours. `colour` is the ANSI code of the colour, such
-    /// as `31` for red. Without a terminal, prints only the text.
+    /// Prints `text`, and rings the bell and colours `word` as [`striking`] does, above the bar if there is one.
     fn striking(&self, text: &str, word: &str, colour: &str) -> Result<(), Failure> {
         // Parts of the text come from a machine or a file.
         let text = &visible(text);
-        let Some(bar) = &self.bar else { return super::print(&format!("{text}\n")) };
-        let columns = console::Term::stdout().size_checked().map_or(usize::MAX, |(_, columns)| columns.into());
-        let mut text = wrapped(text, columns);
-        if !word.is_empty() && console::colors_enabled() {
-            text = text.replacen(word, &format!("\x1b[1;{colour}m{word}\x1b[0m"), 1);
+        match &self.bar {
+            None => super::print(&format!("{text}\n")),
+            Some(bar) => bar.suspend(|| super::print(&striking(text, word, colour))),
         }
-        let bell = if word.is_empty() { "" } else { "\x07" };
-        bar.suspend(|| super::print(&format!("{bell}{text}")))
     }
+}
+
+/// Prints the end of the run in the folder `folder`: the first lines of its report, and the path of the report.
+///
+/// # Errors
+/// Standard output cannot be written.
+pub(super) fn print_end(folder: &Path, ending: &Ending, report: &Path) -> Result<(), Failure> {
+    let (word, colour) = match ending {
+        Ending::Accepted { .. } => ("ACCEPTED", "32"),
+        Ending::NotAccepted { .. } => ("NOT ACCEPTED", "31"),
+        Ending::Stopped { .. } => ("STOPPED", "31"),
+        Ending::Aborted { .. } => ("ABORTED", "31"),
+    };
+    let is_terminal = io::stderr().is_terminal();
+    let columns = if is_terminal { columns() } else { usize::MAX };
+    // A report that was written can be read again.
+    let lines = first_lines(folder, columns).unwrap_or_else(|_| vec![ending_words(ending)]);
+    let text = visible(&format!("\n{}", lines.join("\n")));
+    let text = if is_terminal { striking(&text, word, colour) } else { format!("{text}\n") };
+    // A path that is broken into lines cannot be copied.
+    super::print(&format!("{text}report   {}\n", visible(&report.display().to_string())))
+}
+
+/// Returns `text` for a terminal: in lines that are not wider than it. If `word` is not empty, the text rings the bell, and
+/// has the first occurrence of `word` in colour if the terminal supports colours. `colour` is the ANSI code of the
+/// colour, such as `31` for red.
+fn striking(text: &str, word: &str, colour: &str) -> String {
+    let mut text = wrapped(text, columns());
+    if !word.is_empty() && console::colors_enabled() {
+        text = text.replacen(word, &format!("\x1b[1;{colour}m{word}\x1b[0m"), 1);
+    }
+    let bell = if word.is_empty() { "" } else { "\x07" };
+    format!("{bell}{text}")
+}
+
+/// Returns the number of columns of the terminal.
+fn columns() -> usize {
+    console::Term::stdout().size_checked().map_or(usize::MAX, |(_, columns)| columns.into())
 }
 
 /// Returns the path of the newest error map of the cycle `cycle` in the run folder `run`. Looks first in the folders of
@@ -336,6 +440,14 @@ fn doing(device: Device) -> &'static str {
     match device {
         Device::Cmm => "measuring",
         Device::Grinder => "grinding",
+    }
+}
+
+/// Returns the whole job of a machine as text for a person.
+fn whole_job(device: Device, total: u32) -> String {
+    match device {
+        Device::Cmm => format!("{}, {total} points", doing(device)),
+        Device::Grinder => doing(device).to_owned(),
     }
 }
 

@@ -10,7 +10,7 @@ use ratatui::crossterm::event::{self, Event, KeyCode, KeyEventKind};
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::style::{Color, Style, Stylize};
 use ratatui::text::{Line, Span, Text};
-use ratatui::widgets::{Block, Gauge, Paragraph, Wrap};
+use ratatui::widgets::{Gauge, Paragraph, Wrap};
 use regrind::cell::StateName;
 use regrind::drive::{CycleRow, JobProgress, Request, Snapshot, send_request};
 use regrind::formats::{MapNode, read_error_map};
@@ -22,7 +22,7 @@ use super::blocks::{Blocks, sparkline};
 use super::control;
 use super::failure::Failure;
 use super::show::{how_far, limits, preview_text, pv_name};
-use super::words::time_left;
+use super::words::{three_digits, time_left};
 
 /// Time between two checks for a new map on record.
 const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
@@ -183,28 +183,31 @@ impl View {
         }
     }
 
+    /// Draws the state, the job, the alarms, the table of the cycles, and below them the map in the room that is left. All
+    /// widths have this layout.
     fn draw(&self, frame: &mut Frame) {
         let alarms = self.alarms();
+        let head = self.head();
+        // A line that is broken between words can need one row more than its letters.
+        let rows_of = |line: &Line| 1 + line.width().saturating_sub(1) / usize::from(frame.area().width.max(9) - 8);
+        let head_rows: usize = head.iter().map(rows_of).sum();
         let rows = [
-            Constraint::Length(3),
-            Constraint::Length(2),
+            Constraint::Length(head_rows.min(5) as u16),
+            Constraint::Length(if self.snapshot.progress.is_some() { 2 } else { 0 }),
             Constraint::Length(if alarms.lines.is_empty() { 0 } else { (alarms.lines.len() as u16 * 2).min(9) }),
+            Constraint::Length(match self.snapshot.tolerance {
+                Some(_) => 3 + self.snapshot.cycles.len() as u16,
+                None => 0,
+            }),
             Constraint::Min(6),
             Constraint::Length(1),
         ];
-        let [head, job, alarm, rest, foot] = Layout::vertical(rows).areas(frame.area());
-        frame.render_widget(self.head(), head);
+        let [top, job, alarm, figures, map, foot] = Layout::vertical(rows).areas(frame.area());
+        frame.render_widget(Paragraph::new(head.to_vec()).wrap(Wrap { trim: true }), top);
         self.job(frame, job);
         frame.render_widget(Paragraph::new(alarms).wrap(Wrap { trim: true }).red(), alarm);
-        let wide = rest.width >= 70;
-        let [left, right] = match wide {
-            true => Layout::horizontal([Constraint::Percentage(55), Constraint::Percentage(45)]).areas(rest),
-            false => Layout::vertical([Constraint::Length(3 + self.snapshot.cycles.len() as u16), Constraint::Min(0)])
-                .areas(rest),
-        };
-        let (figures, map) = if wide { (right, left) } else { (left, right) };
         frame.render_widget(self.figures(), figures);
-        self.map(frame, map);
+        self.maps(frame, map);
         let (message, of_state) = &self.said;
         // The hold itself brings the cell through Holding to Held.
         let is_news = !message.is_empty() && self.snapshot.state_number <= of_state + 2;
@@ -212,7 +215,7 @@ impl View {
         frame.render_widget(Paragraph::new(keys).dim(), foot);
     }
 
-    fn head(&self) -> Paragraph<'_> {
+    fn head(&self) -> [Line<'_>; 2] {
         let Snapshot { simulation, state, phase, cycle, max_cycles, next, part, serial, .. } = &self.snapshot;
         let colour = match state {
             StateName::Execute | StateName::Starting | StateName::Unholding | StateName::Unsuspending => Color::Green,
@@ -229,7 +232,7 @@ impl View {
             ),
             Span::raw(format!("{phase}  cycle {cycle} of at most {max_cycles}  {part}  {serial}{marked}")),
         ]);
-        Paragraph::new(vec![first, Line::from(format!("next: {next}"))]).wrap(Wrap { trim: true })
+        [first, Line::from(format!("next: {next}"))]
     }
 
     fn job(&self, frame: &mut Frame, area: Rect) {
@@ -258,32 +261,55 @@ impl View {
     fn figures(&self) -> Paragraph<'_> {
         let Some(tolerance) = self.snapshot.tolerance else { return Paragraph::default() };
         let row = |row: &CycleRow| {
-            let (cycle, [pv_um, rms_um]) = (row.cycle, row.judged_um());
-            Line::from(format!("{cycle:>5} {pv_um:>12.2} {rms_um:>8.3}"))
+            let (CycleRow { cycle, points, outliers, .. }, [pv_um, rms_um]) = (row, row.judged_um());
+            Line::from(format!("{cycle:>5} {pv_um:>13.2} {rms_um:>8.3} {points:>8} {outliers:>9}"))
         };
         let falls = sparkline(self.snapshot.cycles.iter().map(|row| row.judged_um()[1]));
-        let head = Line::from(format!("cycle {:>12} {:>8}", pv_name(&tolerance), "RMS µm"));
-        let lines =
-            [Line::from(limits(&tolerance)), head.dim()].into_iter().chain(self.snapshot.cycles.iter().map(row));
-        Paragraph::new(lines.chain([Line::from(falls).cyan()]).collect::<Vec<_>>()).wrap(Wrap { trim: false })
+        let pv = format!("{} \u{b5}m", pv_name(&tolerance));
+        let head = Line::from(format!("cycle {pv:>13} {:>8} {:>8} {:>9}", "RMS \u{b5}m", "points", "outliers"));
+        let limits = Line::from(vec![
+            Span::raw(format!("tolerance {}   ", limits(&tolerance))),
+            Span::raw(if falls.is_empty() { String::new() } else { format!("RMS {falls}") }).cyan(),
+        ]);
+        let lines = [limits, head.dim()].into_iter().chain(self.snapshot.cycles.iter().map(row));
+        Paragraph::new(lines.collect::<Vec<_>>())
     }
 
-    fn map(&self, frame: &mut Frame, area: Rect) {
+    /// Draws the map of the error, or that of its standard deviation. If there is room for both, they are side by side.
+    fn maps(&self, frame: &mut Frame, area: Rect) {
+        const APART: u16 = 3;
         let Some((_, nodes)) = &self.map else { return };
-        let room = [area.width.saturating_sub(2), area.height.saturating_sub(2)].map(usize::from);
-        let painted = if self.as_sigma { Blocks::paint_sigma } else { Blocks::paint_error };
-        let Some(blocks) = painted(nodes, room) else { return };
-        let colour = |pixel: Option<[u8; 3]>| pixel.map_or(Color::Reset, |[r, g, b]| Color::Rgb(r, g, b));
-        let cell = |[above, below]: &[Option<[u8; 3]>; 2]| {
-            Span::styled("\u{2580}", Style::new().fg(colour(*above)).bg(colour(*below)))
-        };
-        let lines: Vec<Line> = blocks.rows.iter().map(|row| row.iter().map(cell).collect()).collect();
-        let title = match self.as_sigma {
-            true => format!("standard deviation: up to {:.3} µm", blocks.limit_um),
-            false => format!("error, filtered: ± {:.2} µm", blocks.limit_um),
-        };
-        frame.render_widget(Paragraph::new(lines).block(Block::bordered().title(title)), area);
+        let room = [area.width, area.height.saturating_sub(1)].map(usize::from);
+        let [error, sigma] = [Blocks::paint_error, Blocks::paint_sigma].map(|painted| painted(nodes, room));
+        let shown = if self.as_sigma { [sigma, error] } else { [error, sigma] };
+        let mut left = area;
+        for (k, blocks) in shown.into_iter().enumerate() {
+            let Some(blocks) = blocks else { return };
+            let title = match (k == 1) != self.as_sigma {
+                true => format!("standard deviation: up to {} \u{b5}m", three_digits(blocks.limit_um)),
+                false => format!("error, filtered: \u{b1} {} \u{b5}m", three_digits(blocks.limit_um)),
+            };
+            let width = blocks.rows.first().map_or(0, Vec::len).max(title.chars().count()) as u16;
+            if width > left.width {
+                return;
+            }
+            let lines = std::iter::once(Line::from(title)).chain(blocks.rows.iter().map(|row| line_of(row)));
+            frame.render_widget(Paragraph::new(lines.collect::<Vec<_>>()), left);
+            let taken = (width + APART).min(left.width);
+            left = Rect { x: left.x + taken, width: left.width - taken, ..left };
+        }
     }
+}
+
+/// Returns a row of a map as a line of half blocks.
+fn line_of(row: &[[Option<[u8; 3]>; 2]]) -> Line<'static> {
+    let colour = |pixel: Option<[u8; 3]>| pixel.map_or(Color::Reset, |[r, g, b]| Color::Rgb(r, g, b));
+    let cell = |[above, below]: &[Option<[u8; 3]>; 2]| match (above, below) {
+        (None, None) => Span::raw(" "),
+        (None, below) => Span::styled("\u{2584}", Style::new().fg(colour(*below))),
+        (above, below) => Span::styled("\u{2580}", Style::new().fg(colour(*above)).bg(colour(*below))),
+    };
+    row.iter().map(cell).collect()
 }
 
 /// Starts a thread that reads pressed keys, and returns the channel on which the keys arrive. Ctrl-C arrives as Esc.

@@ -38,15 +38,37 @@ pub(super) fn first_page(report: &Report, registration: Option<&Value>) -> Resul
 fn head(report: &Report) -> String {
     let story = report.story;
     let [name, ..] = story.start.content.names();
-    let part = story.start.content.part();
-    let mut identity = vec![format!("{} {}", report.say(Text::Serial), report.serial())];
-    identity
-        .extend(part.and_then(|part| part.drawing.as_ref()).map(|of| format!("{} {of}", report.say(Text::Drawing))));
-    identity
-        .extend(part.and_then(|part| part.material.as_ref()).map(|of| format!("{} {of}", report.say(Text::Material))));
-    let identity: Vec<String> = identity.iter().map(|text| escaped(text)).collect();
+    let identity: Vec<String> = identity(report).iter().map(|text| escaped(text)).collect();
     let mark = if story.start.simulation == Some(true) { " <span class=\"mark\">SIMULATION</span>" } else { "" };
     let (class, verdict, words, is_good) = outcome(report);
+    let unrecorded = story.ending.is_some() && story.end.is_none();
+    let more = if unrecorded { format!("<p>{}</p>\n", report.say(Text::RecordIncomplete)) } else { String::new() };
+    format!(
+        "<div class=\"head\">\n<div>\n<h1>{}</h1>\n<p>{}{mark}</p>\n<p>{}</p>\n</div>\n\
+         <div class=\"verdict {class}\"><strong>{}</strong></div>\n</div>\n<p class=\"{}\">{}</p>\n{more}",
+        escaped(name.unwrap_or("Part")),
+        identity.join(" \u{b7} "),
+        escaped(&inspection(report)),
+        report.say(verdict),
+        if is_good { "good" } else { "bad" },
+        escaped(&words)
+    )
+}
+
+/// Returns serial number, drawing and material, each with its name.
+pub(super) fn identity(report: &Report) -> Vec<String> {
+    let part = report.story.start.content.part();
+    let stated = [
+        (Text::Serial, Some(report.serial())),
+        (Text::Drawing, part.and_then(|part| part.drawing.as_deref())),
+        (Text::Material, part.and_then(|part| part.material.as_deref())),
+    ];
+    stated.into_iter().filter_map(|(text, of)| Some(format!("{} {}", report.say(text), of?))).collect()
+}
+
+/// Returns the kind of the report, the judged cycle, and the time of the end.
+pub(super) fn inspection(report: &Report) -> String {
+    let story = report.story;
     let last = story.cycles.keys().next_back().copied().unwrap_or(0);
     let judged = story.last_measured().map_or(last, |(cycle, ..)| cycle);
     let at = story.end.as_ref().map_or(&story.last, |end| &end.utc);
@@ -55,18 +77,7 @@ fn head(report: &Report) -> String {
         0 => String::new(),
         judged => format!(", {} {judged} {} {last}", report.say(Text::Cycle), report.say(Text::CountOf)),
     };
-    let unrecorded = story.ending.is_some() && story.end.is_none();
-    let more = if unrecorded { format!("<p>{}</p>\n", report.say(Text::RecordIncomplete)) } else { String::new() };
-    format!(
-        "<div class=\"head\">\n<div>\n<h1>{}</h1>\n<p>{}{mark}</p>\n<p>{kind}{cycle}, {}</p>\n</div>\n\
-         <div class=\"verdict {class}\"><strong>{}</strong></div>\n</div>\n<p class=\"{}\">{}</p>\n{more}",
-        escaped(name.unwrap_or("Part")),
-        identity.join(" \u{b7} "),
-        escaped(&when(at)),
-        report.say(verdict),
-        if is_good { "good" } else { "bad" },
-        escaped(&words)
-    )
+    format!("{kind}{cycle}, {}", when(at))
 }
 
 /// Returns how the run ended: the class of the box, its word, the reason, and true if the end is good.
@@ -155,7 +166,7 @@ fn judged_row(report: &Report, compared: &ComparedFigure, tolerance: &Tolerance)
 }
 
 /// Formats a length in micrometres with two decimals.
-fn um(report: &Report, mm: f64) -> String {
+pub(super) fn um(report: &Report, mm: f64) -> String {
     decimal(1e3 * mm, 2, report.language)
 }
 
@@ -167,11 +178,7 @@ fn comparison(report: &Report, compared: &ComparedFigure, with_uncertainty: bool
     if !limit_mm.is_finite() {
         return String::new();
     }
-    let words = report.say(match conformity {
-        Conformity::Within => Text::WithinLimit,
-        Conformity::Undecided => Text::Undecided,
-        Conformity::Beyond => Text::BeyondLimit,
-    });
+    let words = report.say(conformity_text(conformity));
     let beside = |text: Option<Text>, value: f64| {
         let is = if value <= limit_mm { "\u{2264}" } else { "&gt;" };
         // Two different numbers must not be shown as the same number.
@@ -190,6 +197,15 @@ fn comparison(report: &Report, compared: &ComparedFigure, with_uncertainty: bool
         }
     };
     format!("{words}: {sums}")
+}
+
+/// Returns the text for the comparison of a figure with its limit.
+pub(super) fn conformity_text(conformity: Conformity) -> Text {
+    match conformity {
+        Conformity::Within => Text::WithinLimit,
+        Conformity::Undecided => Text::Undecided,
+        Conformity::Beyond => Text::BeyondLimit,
+    }
 }
 
 fn decision_rule(report: &Report, tolerance: &Tolerance) -> String {

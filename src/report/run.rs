@@ -25,7 +25,7 @@ use super::report_content::{Report, ReportOptions, when};
 use super::run_history::{AlarmHistory, Measurement, Order, RunHistory};
 use super::shop_header::ShopHeader;
 use super::texts::{self, ReportText as Text};
-use super::words::{judgement_words, verdict_words};
+use super::words::judgement_words;
 use regrind_cell::{Figures, PvPoints, RecordedParameter, Tolerance};
 use regrind_formats::run_files::RunFile;
 use regrind_formats::{escaped, write_atomic};
@@ -315,8 +315,7 @@ fn judgement_of(report: &Report, measurement: &Measurement) -> (String, String) 
         return (report.say(found).to_owned(), measurement.unusable.clone().unwrap_or_default());
     };
     let earlier: String = earlier.iter().map(|earlier| format!("; first {}", judgement_words(earlier))).collect();
-    let verdict = texts::verdict(last.verdict).map_or_else(|| verdict_words(last), |text| report.say(text).to_owned());
-    (verdict, format!("{}{earlier}", last.reason))
+    (texts::verdict_in_words(last.verdict, report.language), format!("{}{earlier}", last.reason))
 }
 
 /// Returns the definitions of the figures, with the rule by which the part was judged.
@@ -380,15 +379,20 @@ fn alarms(report: &Report) -> String {
     format!("<h2>{title}</h2>\n<table id=\"alarms\">\n<thead><tr>{heads}</tr></thead>\n{rows}</table>\n")
 }
 
+/// Returns the answer to an order of a person: accepted, or refused with the reason. An order that went directly to a
+/// machine and not to the cell has no answer of its own, because later records show its result.
+fn answer(report: &Report, order: &Order) -> String {
+    match (&order.refused, &order.event) {
+        (Some(reason), _) => format!("{}: {reason}", report.say(Text::AnswerRefused)),
+        (None, Some(_)) => report.say(Text::AnswerAccepted).to_owned(),
+        (None, None) => report.say(Text::AnswerOnRecord).to_owned(),
+    }
+}
+
 fn orders(report: &Report) -> String {
     let row = |order: &Order| {
         let record = &order.record;
-        [
-            when(&record.utc),
-            format!("{} at {}", record.actor, record.station),
-            order.words(),
-            order.answer(report.language),
-        ]
+        [when(&record.utc), format!("{} at {}", record.actor, record.station), order.words(), answer(report, order)]
     };
     let heads = [Text::Given, Text::By, Text::Order, Text::Answer];
     table(report, [Text::OrdersAndConfirmations, Text::NoOrder], "orders", heads, report.story.orders.iter().map(row))

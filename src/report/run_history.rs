@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::ReportError;
-use super::texts::ReportText as Text;
 use super::words::{gate_words, words};
 use regrind_cell::{
     Alarm, AlarmId, Command, Device, Ending, Event, Figures, GateResult, JobResult, Judgement, Reconciliation,
@@ -12,7 +11,6 @@ use regrind_cell::{
 };
 use regrind_formats::run_files::{CycleFile, CycleFolder};
 use regrind_journal::{Reader, Record, RecordKind, Verified, verify};
-use regrind_language::Language;
 use regrind_record::{
     Begin, Content, EventDetail, EventRecord, PartEnd, PassFigures, Remark, RunContent, RunEnd, TouchCounts,
 };
@@ -140,7 +138,7 @@ pub struct HoldOrder {
 pub(super) struct Order {
     pub(super) record: Record,
     /// Event that the cell processed; `None` for an order that goes directly to a machine, past the cell.
-    event: Option<Event>,
+    pub(super) event: Option<Event>,
     pub(super) refused: Option<String>,
 }
 
@@ -363,15 +361,5 @@ impl RunHistory {
 impl Order {
     pub(super) fn words(&self) -> String {
         words(&self.record)
-    }
-
-    /// Returns the answer to this order of a person: accepted, or refused with the reason. An order that went directly to
-    /// a machine and not to the cell has no answer of its own, because later records show its result.
-    pub(super) fn answer(&self, language: Language) -> String {
-        match (&self.refused, &self.event) {
-            (Some(reason), _) => format!("{}: {reason}", Text::AnswerRefused.to(language)),
-            (None, Some(_)) => Text::AnswerAccepted.to(language).to_owned(),
-            (None, None) => Text::AnswerOnRecord.to(language).to_owned(),
-        }
     }
 }

@@ -42,6 +42,11 @@ regrind_language::texts! {
     ReducesRmsBy ErrorLeftForMap
 }
 
+/// Returns the verdict on a cycle in words.
+pub fn verdict_in_words(of: Verdict, language: Language) -> String {
+    verdict(of).map_or_else(|| super::words::recorded_name(&of), |text| text.to(language).to_owned())
+}
+
 /// Returns the word for a verdict.
 pub(super) fn verdict(verdict: Verdict) -> Option<ReportText> {
     Some(match verdict {

@@ -2,6 +2,8 @@
 
 use std::fs;
 
+use serde_json::Value;
+
 use crate::program::{run, run_folders, small_recipe};
 
 #[test]
@@ -65,4 +67,40 @@ fn accepted_part_is_named_when_it_is_made_again() {
     let (_, again, _) = make("SN-1");
     assert!(again.contains(&format!("SN-1 was ACCEPTED before, in runs/{name}")), "{again}");
     assert!(!make("SN-2").1.contains("ACCEPTED before"));
+}
+
+/// A pipe gets one line for each phase and one row for each cycle, and at the end the first lines of the report with the
+/// figures of the results. No line has a code for colours.
+#[test]
+fn piped_run_has_a_line_a_phase_and_a_row_a_cycle() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e5).display().to_string();
+    let (code, said, errors) = run(&["run", &recipe, "--part", "SN-1"], home.path());
+    assert!(code == 0 && !said.contains('\x1b') && !errors.contains('\x1b'), "{said}{errors}");
+    let folder = run_folders(&home.path().join("runs")).remove(0);
+    let result: Value = serde_json::from_slice(&fs::read(folder.join("result.json")).unwrap()).unwrap();
+    let cycles = result["cycles"].as_array().unwrap();
+    let lines: Vec<&str> = said.lines().collect();
+    for cycle in cycles {
+        let number = &cycle["cycle"];
+        // A job that is over at once reports no progress, and has no line.
+        for (phase, least) in [("grinding", 0), ("measuring, ", 0), ("217 points fetched", 1)] {
+            let begin = format!("cycle {number}: {phase}");
+            let count = lines.iter().filter(|line| line.starts_with(&begin)).count();
+            assert!((least..=1).contains(&count), "{begin}: {said}");
+        }
+        let of = |key: &str| cycle[key].as_f64().unwrap();
+        let [pv, rms] = [format!("{:.2} \u{b1} ", of("judged_pv_um")), format!("{:.3} \u{b1} ", of("judged_rms_um"))];
+        let is_row = |line: &&&str| {
+            line.starts_with(&format!("{:>5} ", number.as_u64().unwrap())) && line.contains(&pv) && line.contains(&rms)
+        };
+        assert_eq!(lines.iter().filter(is_row).count(), 1, "{pv} {rms}: {said}");
+    }
+    let last = cycles.last().unwrap();
+    let table = lines.iter().position(|line| line.starts_with("figure ")).unwrap();
+    for (line, key) in lines[table + 1..].iter().zip(["judged_pv_um", "judged_rms_um"]) {
+        assert!(line.contains(&format!(" {:.2} ", last[key].as_f64().unwrap())), "{key}: {line}");
+        assert!(line.ends_with("within the limit") && line.chars().count() <= 80, "{line}");
+    }
+    assert!(lines.last().unwrap().starts_with("report   runs/"), "{said}");
 }
