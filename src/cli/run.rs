@@ -14,7 +14,7 @@ use regrind::formats::run_files::{CycleFolder, RunFile};
 use regrind::formats::{KnowledgeOrigin, Learned, LearnedError, SettingIdentity};
 use regrind::journal::{AuditKey, Header, Journal, Reader, free_bytes, utc_to_the_second};
 use regrind::recipe::Recipe;
-use regrind::record::{PartStart, RecordedPlan, RunContent};
+use regrind::record::{MeasuringStrategy, PartStart, RecordedPlan, RunContent};
 use regrind::setup;
 
 use super::control::folders;
@@ -359,6 +359,7 @@ fn header(
             part_in_files: Some(live.part.to_owned()),
             job: Some(live.job),
             seed: arguments.seed,
+            measuring: measuring_strategy(task),
             plan: RecordedPlan::new(plan),
             table_version: Some(TABLE_VERSION),
             machines_within: Some(machines_within),
@@ -371,6 +372,17 @@ fn header(
         }))
         .into(),
     }
+}
+
+/// Returns the measuring strategy of a task; `None` if it has no targets.
+fn measuring_strategy(task: &Task) -> Option<MeasuringStrategy> {
+    (!task.targets.is_empty()).then(|| MeasuringStrategy {
+        targets: task.targets.len(),
+        adaptive: task.adaptive.is_some(),
+        sphere_points: task.reference_sphere.map_or(0, |sphere| sphere.points),
+        speed_mm_s: task.probing.speed_mm_s,
+        approach_mm: task.probing.approach_mm,
+    })
 }
 
 fn begin(

@@ -122,6 +122,9 @@ pub struct PartStart {
     /// Seed of another simulated part; `None` for the part of the recipe.
     #[serde(default)]
     pub seed: Option<u64>,
+    /// Measuring strategy; `None` if the machine measures by its own program.
+    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "or_none")]
+    pub measuring: Option<MeasuringStrategy>,
     /// Parameters by which the cell decides.
     #[serde(default)]
     pub plan: RecordedPlan,
@@ -149,6 +152,21 @@ pub struct PartStart {
     /// Run before it, as its anchor was when this run began.
     #[serde(default)]
     pub before: Option<PreviousRun>,
+}
+
+/// Measuring strategy of a run, for its report.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MeasuringStrategy {
+    /// Number of targets on the part.
+    pub targets: usize,
+    /// True if targets are chosen while others are touched, until enough is known.
+    pub adaptive: bool,
+    /// Number of points on the reference sphere; 0 if there is none.
+    pub sphere_points: usize,
+    /// Speed towards a target, in mm/s.
+    pub speed_mm_s: f64,
+    /// Distance from a target at which the probe begins to search, in mm.
+    pub approach_mm: f64,
 }
 
 /// Start of a recovery of machines.

@@ -12,7 +12,7 @@ mod end;
 mod event;
 mod note;
 
-pub use begin::{PartStart, PreviousRun, RecordedPlan, RecoveryStart, RunContent, begin_of};
+pub use begin::{MeasuringStrategy, PartStart, PreviousRun, RecordedPlan, RecoveryStart, RunContent, begin_of};
 pub use content::Content;
 pub use end::{PartEnd, RecoveryEnd, RunEnd, TouchCounts};
 pub use event::{Answer, CommandRecord, EventDetail, EventRecord, StartIntent};

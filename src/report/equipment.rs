@@ -15,10 +15,11 @@ use regrind_cell::Device;
 use regrind_formats::run_files::CycleFile;
 use regrind_formats::{FormatError, escaped};
 use regrind_language::decimal;
+use regrind_record::MeasuringStrategy;
 
 /// Returns the HTML table of the machines, the wheel and the probe of a run. `registration` is the content of the newest
-/// file `registration.json`, or `None` if there is no such file. A value that is not on record is shown as not reported.
-pub(super) fn equipment(report: &Report, registration: Option<&Value>) -> String {
+/// file `registration.json`, or `None` if there is no such file; `folder` is the run folder. A value that is not on record is shown as not reported.
+pub(super) fn equipment(report: &Report, registration: Option<&Value>, folder: &Path) -> String {
     let story = report.story;
     let machine = |device: Device| {
         let [name, address] = story.machines[device as usize].clone()?;
@@ -32,11 +33,15 @@ pub(super) fn equipment(report: &Report, registration: Option<&Value>) -> String
         .radius_error_mm
         .map(|(cycle, mm)| format!("; {} {cycle}: {} \u{b5}m", report.say(Text::SphereRadius), number(1e3 * mm, 2)));
     let probe = probe_mm.map(|mm| format!("{}{}", radius(mm, 5), off.unwrap_or_default()));
+    let strategy = story.start.content.part().and_then(|part| part.measuring);
+    let celsius = temperature_c(story, folder).map(|celsius| format!("{} \u{b0}C", number(celsius, 2)));
     let rows = [
         (Text::MeasuringMachine, machine(Device::Cmm)),
         (Text::Grinder, machine(Device::Grinder)),
         (Text::Wheel, wheel),
         (Text::Probe, probe),
+        (Text::MeasuringStrategy, strategy.map(|of| strategy_in_words(report, &of))),
+        (Text::PartTemperature, celsius),
     ];
     let row = |(key, value): (Text, Option<String>)| {
         let value = value.unwrap_or_else(|| report.say(Text::NotReported).to_owned());
@@ -44,6 +49,32 @@ pub(super) fn equipment(report: &Report, registration: Option<&Value>) -> String
     };
     let rows: String = rows.into_iter().map(row).collect();
     format!("<h2>{}</h2>\n<table id=\"means\">\n{rows}</table>\n", report.say(Text::Machines))
+}
+
+fn strategy_in_words(report: &Report, of: &MeasuringStrategy) -> String {
+    let number = |value: f64, digits: usize| decimal(value, digits, report.language);
+    let targets = report.say(if of.adaptive { Text::TargetsChosen } else { Text::TargetsAll });
+    let sphere = match of.sphere_points {
+        0 => String::new(),
+        points => format!("; {points} {}", report.say(Text::SpherePoints)),
+    };
+    format!(
+        "{} {targets}{sphere}; {} {} mm/s; {} {} mm",
+        of.targets,
+        report.say(Text::ProbingSpeed),
+        number(of.speed_mm_s, 2),
+        report.say(Text::ApproachDistance),
+        number(of.approach_mm, 2)
+    )
+}
+
+/// Returns the temperature of the part at the last measurement that has it on record, or else at the last pass.
+fn temperature_c(story: &RunHistory, folder: &Path) -> Option<f64> {
+    let measured = story.cycles.values().rev().find_map(|of| {
+        let bytes = fs::read(folder.join(of.conditions.as_ref()?)).ok()?;
+        serde_json::from_slice::<Value>(&bytes).ok()?["temperature_c"].as_f64()
+    });
+    measured.or_else(|| story.cycles.values().rev().find_map(|of| of.pass.as_ref()?.temperature_c))
 }
 
 /// Reads the file `model.json` of the last cycle whose measurement was registered. `story` is the history of the run

@@ -12,7 +12,7 @@ use super::axis::three_digits;
 use super::report_content::Report;
 use super::texts::ReportText as Text;
 use regrind_formats::{FormatError, escaped};
-use regrind_language::localised;
+use regrind_language::{decimal, localised};
 
 /// Returns the HTML section about the form of the surface. Its tables have a row for each figure, such as PV, and a
 /// column for each cycle that has figures. `folder` is the run folder. Returns an empty text if no cycle has figures.
@@ -28,7 +28,7 @@ pub(super) fn form(report: &Report, folder: &Path) -> Result<String, ReportError
     let Some((_, last)) = cycles.last() else { return Ok(String::new()) };
     let title = report.say(Text::FormOfSurface);
     let html = format!("<h2>{title}</h2>\n{}{}", estimated_figures(report, &cycles, last), raw(report, &cycles, last));
-    Ok(html + &notations(report, &cycles))
+    Ok(html + &notations(report, &cycles) + &zernike(report, last))
 }
 
 /// Reads a file `figures.json`, which holds the figures of a cycle.
@@ -185,4 +185,62 @@ fn notations(report: &Report, cycles: &[(u32, Value)]) -> String {
         );
     }
     html + "</ul>\n"
+}
+
+/// Returns the table of the Zernike coefficients of the last cycle. Returns an empty text if the part is not round, because
+/// the polynomials of a disc that it does not fill have no meaning of their own.
+fn zernike(report: &Report, last: &Value) -> String {
+    /// Number of coefficients side by side.
+    const BESIDE: usize = 4;
+    let fit = &last["zernike"];
+    let Some(radius_mm) = fit["half_size_mm"][0].as_f64().filter(|radius_mm| is_round(*radius_mm, &last["legendre"]))
+    else {
+        return String::new();
+    };
+    let um = |nm: &Value| nm.as_f64().map_or("-".to_owned(), |nm| decimal(1e-3 * nm, 4, report.language));
+    let cells: Vec<String> = listed(fit, "terms")
+        .iter()
+        .map(|term| {
+            let name = escaped(term["term"].as_str().unwrap_or_default());
+            format!("<td class=\"t\">{name}</td><td class=\"n\">{}</td>", um(&term["coefficient_nm"]))
+        })
+        .collect();
+    // The order runs down the columns.
+    let rows = cells.len().div_ceil(BESIDE);
+    let row =
+        |first: usize| format!("<tr>{}</tr>\n", cells.iter().skip(first).step_by(rows).cloned().collect::<String>());
+    let rows: String = (0..rows).map(row).collect();
+    let [title, note, residual] = [Text::Zernike, Text::ZernikeNote, Text::Residual].map(|text| report.say(text));
+    format!(
+        "<h3>{title}</h3>\n<table id=\"zernike\" class=\"narrow\">\n{rows}</table>\n<p>{note}, {} {} mm; {residual} {} \u{b5}m RMS.</p>\n",
+        report.say(Text::Radius),
+        decimal(radius_mm, 3, report.language),
+        um(&fit["residual_rms_nm"])
+    )
+}
+
+/// Returns true if a part is round: the rectangle around its points has sides of the diameter of the disc around them.
+/// `around` is the fit of Legendre polynomials, which has this rectangle.
+fn is_round(radius_mm: f64, around: &Value) -> bool {
+    /// The outermost points are a little within the edge.
+    const TOLERANCE: f64 = 0.05;
+    let half = |k: usize| around["half_size_mm"][k].as_f64().unwrap_or(0.0);
+    [0, 1].iter().all(|k| (half(*k) / radius_mm - 1.0).abs() < TOLERANCE)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn only_round_parts_are_round() {
+        let around = |sides: [f64; 2]| json!({ "half_size_mm": sides });
+        assert!(is_round(20.0, &around([19.6, 20.0])));
+        // A square, a rectangle, an ellipse, and figures without this fit.
+        for sides in [[14.1, 14.1], [18.0, 8.7], [20.0, 12.0]] {
+            assert!(!is_round(20.0, &around(sides)), "{sides:?}");
+        }
+        assert!(!is_round(20.0, &Value::Null));
+    }
 }

@@ -106,7 +106,7 @@ pub(super) fn html(report: &Report, folder: &Path) -> Result<String, ReportError
         .map_or(String::new(), |(cycle, found)| registered(report, cycle, &found, last_model(story, folder).as_ref()));
     html += &form(report, folder)?;
     html += &cycles(report);
-    html += &equipment(report, last_registration(story, folder)?.as_ref().map(|(_, found)| found));
+    html += &equipment(report, last_registration(story, folder)?.as_ref().map(|(_, found)| found), folder);
     html += &alarms(report);
     html += &orders(report);
     html += &definitions(report);

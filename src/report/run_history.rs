@@ -75,6 +75,8 @@ pub(super) struct CycleHistory {
     pub(super) radius_error_mm: Option<f64>,
     /// Estimates of the parameters of the machine.
     pub(super) parameters: Vec<RecordedParameter>,
+    /// Name of the file of the conditions of the measurement within the run folder.
+    pub(super) conditions: Option<String>,
     /// Root mean square of the error that is left for the map in addition to the parameters, in millimetres.
     pub(super) map_rms_mm: Option<f64>,
 }
@@ -326,6 +328,7 @@ impl RunHistory {
             Some(CycleFile::ErrorMap) => self.cycle(record.cycle).map = Some((name, record.utc.clone())),
             Some(CycleFile::Deviations) => self.cycle(record.cycle).deviations = Some(name),
             Some(CycleFile::Registration) => self.cycle(record.cycle).registration = Some(name),
+            Some(CycleFile::Conditions) => self.cycle(record.cycle).conditions = Some(name),
             Some(CycleFile::Figures) => self.cycle(record.cycle).form = Some(name),
             _ => {}
         }

@@ -40,6 +40,9 @@ regrind_language::texts! {
     RunHasNotEnded NotJudged NotMeasured NoFigures ClearsItself ByOperator ByProcessEngineer AnswerAccepted
     AnswerRefused AnswerOnRecord ParametersOfMachine Parameter EstimatedError Compensated CorrectionOfNextPass
     ReducesRmsBy ErrorLeftForMap
+    // Measuring strategy and Zernike coefficients.
+    MeasuringStrategy TargetsAll TargetsChosen SpherePoints ProbingSpeed ApproachDistance
+    PartTemperature Zernike ZernikeNote Residual
 }
 
 /// Returns the verdict on a cycle in words.

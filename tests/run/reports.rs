@@ -192,6 +192,10 @@ fn means_registration_and_signatures(page: &Page, folder: &Path, cycles: usize) 
     for piece in ["reference sphere", &format!("cycle {cycles}: ")] {
         assert!(means[3].contains(piece), "{piece}: {means:?}");
     }
+    let strategy = "192 targets, all are touched; 25 points on the reference sphere; speed towards a target 5.00 mm/s; approach distance 2.00 mm";
+    assert_eq!(means[4], strategy);
+    assert!(means[5].ends_with(" \u{b0}C"), "{means:?}");
+    assert!(page.texts(|node| node.attribute("id") == Some("zernike")).is_empty(), "a rectangle is not round");
     let registration = cells("registration");
     let used = format!("{} / {} points used", found["used"], found["points"]);
     assert!(registration[0].contains("converged, ") && registration[0].contains(&used), "{registration:?}");

@@ -135,10 +135,11 @@ impl Markup {
         const LONG: usize = 24;
         let has_long = longest.iter().any(|letters| *letters > LONG);
         // Without a long text, the last column of words takes the rest.
+        let is_narrow = class_of(table).contains(&"narrow");
         let rest = (0..count).rev().find(|column| !is_number(*column)).unwrap_or(count);
         let columns = list(&|column| match longest[column] {
             letters if letters > LONG => format!("{letters}fr"),
-            _ if !has_long && column == rest => "1fr".to_owned(),
+            _ if !has_long && !is_narrow && column == rest => "1fr".to_owned(),
             _ => "auto".to_owned(),
         });
         let has_large = rows.iter().flatten().any(|cell| class_of(*cell).contains(&"big"));
