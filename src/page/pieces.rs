@@ -4,7 +4,7 @@
 use maud::{Markup, html};
 use regrind_cell::{Alarm, Device, Phase, Role, StateName, Tolerance};
 use regrind_control::{JobProgress, NextStep, PreviewStatistics, Snapshot};
-use regrind_report::{AlarmAcknowledgement, AlarmHistory, CycleSummary, RunResult, RunSummary};
+use regrind_report::{AlarmAcknowledgement, AlarmHistory, CycleSummary, RunResult, RunSummary, verdict_in_words};
 
 use super::alarms::alarm_texts;
 use super::chart::chart;
@@ -423,6 +423,11 @@ fn standing(
     }
 }
 
+/// Returns the decision on a cycle in words; the reason why there is none, if it was not judged.
+fn decision(of: &CycleSummary, language: Language) -> String {
+    of.decision.map_or_else(|| of.reason.clone(), |decision| verdict_in_words(decision, language))
+}
+
 /// Returns the HTML of the last judged figures: PV and RMS, each as a number with its uncertainty and its limit, and as
 /// a bar that shows all three. If nothing was measured, returns a sentence.
 fn judged(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, language: Language) -> Markup {
@@ -434,7 +439,7 @@ fn judged(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, language: Lang
     html! {
         p .verdict {
             (say(Text::Cycle)) " " (of.cycle) ": "
-            strong title=(of.reason) { (of.verdict.as_deref().unwrap_or(&of.reason)) }
+            strong title=(of.reason) { (decision(of, language)) }
         }
         (gauge("PV", pv_um, limit_um(0), 2, language))
         (gauge("RMS", rms_um, limit_um(1), 3, language))
@@ -465,7 +470,7 @@ pub(super) fn figures(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, la
                         }
                         None => { @for _ in 0..4 { td .n { "–" } } }
                     }
-                    td title=(of.reason) { (of.verdict.as_deref().unwrap_or(&of.reason)) }
+                    td title=(of.reason) { (decision(of, language)) }
                 }
             }
             @if let Some(tolerance) = tolerance {

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::ReportError;
 use super::run_history::{AlarmHistory, CycleHistory, HoldOrder, RunHistory};
 use super::words::{ending_words, home_words, verdict_words};
-use regrind_cell::{Ending, Tolerance};
+use regrind_cell::{Ending, Tolerance, Verdict};
 use regrind_journal::{Reader, Record};
 use regrind_record::PassFigures;
 
@@ -94,6 +94,8 @@ pub struct CycleSummary {
     pub cycle: u32,
     /// Verdict; `None` if the cycle was not judged.
     pub verdict: Option<String>,
+    /// The same verdict, for words in another language.
+    pub decision: Option<Verdict>,
     /// Reason for the verdict.
     pub reason: String,
     /// PV and RMS, each with its expanded uncertainty, as they were judged; `None` if nothing was measured.
@@ -180,6 +182,7 @@ fn cycle_summary(cycle: u32, story: &CycleHistory, tolerance: Option<&Tolerance>
     CycleSummary {
         cycle,
         verdict: judgement.map(verdict_words),
+        decision: judgement.map(|judgement| judgement.verdict),
         reason: judgement.map_or_else(unusable, |judgement| judgement.reason.clone()),
         figures,
         left_out: last.and_then(|of| of.figures.as_ref()?.with_outliers.as_ref()).map(|of| of.description.clone()),
