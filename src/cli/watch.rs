@@ -338,3 +338,101 @@ fn keys() -> mpsc::Receiver<KeyCode> {
     });
     keys
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratatui::Terminal;
+    use ratatui::backend::TestBackend;
+    use regrind::cell::{Device, PvPoints, Tolerance};
+
+    /// A cell in its second pass, with the map of a part of 100 mm by 60 mm.
+    fn view(serial: &str) -> View {
+        let row = |cycle, pv_um| CycleRow {
+            cycle,
+            pv_um,
+            judged_pv_um: None,
+            rms_um: 0.1 * pv_um,
+            judged_rms_um: None,
+            points: 1800,
+            outliers: 0,
+            level_um: 20.0,
+        };
+        let node = |k: usize| {
+            let [x, y] = [(k % 100) as f64, (k / 100) as f64];
+            MapNode { at_mm: [x, y], error_mm: 1e-5 * (x - y), sigma_mm: 1e-4 }
+        };
+        View {
+            snapshot: Snapshot {
+                part: "free-form mirror".into(),
+                serial: serial.into(),
+                simulation: true,
+                cycle: 2,
+                max_cycles: 5,
+                tolerance: Some(Tolerance {
+                    pv_mm: 7e-3,
+                    rms_mm: 1e-3,
+                    with_uncertainty: true,
+                    probability: Tolerance::DEFAULT_PROBABILITY,
+                    pv_points: PvPoints::MostPoints,
+                }),
+                cycles: vec![row(1, 29.53), row(2, 3.87)],
+                progress: Some(JobProgress { device: Device::Grinder, done: 30, total: 100, remaining_s: None }),
+                ..Snapshot::default()
+            },
+            folder: PathBuf::from("runs/a"),
+            map: Some(("cycle-1/error_map.csv".into(), (0..6000).map(node).collect())),
+            as_sigma: false,
+            looked: None,
+            said: (String::new(), 0),
+        }
+    }
+
+    /// Returns the rows of the screen as texts, and the number of half blocks of the map.
+    fn drawn(view: &View, size: [u16; 2]) -> (Vec<String>, usize) {
+        let mut terminal = Terminal::new(TestBackend::new(size[0], size[1])).unwrap();
+        terminal.draw(|frame| view.draw(frame)).unwrap();
+        let buffer = terminal.backend().buffer().clone();
+        let row = |y: u16| (0..size[0]).map(|x| buffer[(x, y)].symbol().to_owned()).collect::<String>();
+        let rows: Vec<String> = (0..size[1]).map(row).collect();
+        let blocks = rows.iter().flat_map(|row| row.chars()).filter(|c| ['\u{2580}', '\u{2584}'].contains(c)).count();
+        (rows, blocks)
+    }
+
+    #[test]
+    fn every_width_has_the_same_rows() {
+        for size in [[60, 24], [80, 24], [120, 40], [200, 50]] {
+            let (rows, blocks) = drawn(&view("SN-9"), size);
+            let all = rows.join("\n");
+            for words in [
+                "cycle 2 of at most 5",
+                "SN-9",
+                "SIMULATION",
+                "grinding, 30.0 % of the path",
+                "cycle  PV 99.8 % \u{b5}m   RMS \u{b5}m   points  outliers",
+                "    1         29.53    2.953     1800         0",
+                "    2          3.87    0.387     1800         0",
+                "error, filtered: \u{b1}",
+            ] {
+                assert!(all.contains(words), "{words}: {size:?}\n{all}");
+            }
+            assert!(rows.last().unwrap().starts_with("h hold   u uncertainty   q quit"), "{size:?}\n{all}");
+            assert!(blocks > usize::from(size[1]) * 10, "{blocks} blocks of a map: {size:?}\n{all}");
+            // The map has no holes: between the first and the last block of a row there is no blank.
+            for row in rows.iter().filter(|row| row.contains('\u{2580}')) {
+                let map = row.trim_matches(' ').split("   ").next().unwrap();
+                assert!(!map.contains(' '), "{size:?}: {row:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn small_terminals_and_long_names_are_drawn() {
+        for size in [[1, 1], [10, 5], [40, 12], [60, 24]] {
+            let (rows, _) = drawn(&view(&"long serial ".repeat(30)), size);
+            assert_eq!(rows.len(), usize::from(size[1]));
+        }
+        let empty = View { map: None, snapshot: Snapshot::default(), ..view("a") };
+        assert_eq!(drawn(&empty, [80, 24]).1, 0);
+    }
+}

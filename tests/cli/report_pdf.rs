@@ -108,6 +108,13 @@ fn assert_pages(pages: &[String], folder: &Path) {
         let indication = indication.as_str().unwrap();
         assert!(all.contains(indication), "{indication}: {all}");
     }
+    // The table of the form is longer than its page, so its head is repeated.
+    let is_head = |page: &&String| page.contains("figure cycle 1 cycle 2 raw, last cycle unit meaning");
+    assert_eq!(pages.iter().filter(is_head).count(), 2, "{all}");
+    // Lengths are in micrometres, with the sign of the unit.
+    for unit in [" um ", " um,", " urad ", " nm ", " nm,"] {
+        assert!(!all.contains(unit), "{unit:?}: {all}");
+    }
     for (k, page) in pages.iter().enumerate() {
         assert!(page.contains(&format!("SN-7 \u{b7} SIMULATION \u{b7} page {} of {}", k + 1, pages.len())), "{page}");
     }
