@@ -10,7 +10,9 @@ use regrind::journal::{
     Anchor, DATABASE, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Verified, verify_against,
 };
 use regrind::record::{Begin, RunContent, begin_of};
-use regrind::report::{Paper, ReportOptions, report_options, run_label, run_report, run_report_pdf, words};
+use regrind::report::{
+    Paper, ReportOptions, label_language, pdf_language, report_options, run_label, run_report, run_report_pdf, words,
+};
 use serde_json::json;
 
 use super::Outcome;
@@ -238,8 +240,9 @@ fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     if has(html) && run_report(folder, &options).ok().as_ref() != Some(&text) {
         lines += &changed_report(html, "");
     }
-    let written = std::fs::read_to_string(folder.join(label)).ok();
-    if has(label) && run_label(folder, &options).ok() != written {
+    let written = std::fs::read_to_string(folder.join(label)).unwrap_or_default();
+    let of_label = ReportOptions { language: label_language(&written), header: None };
+    if has(label) && run_label(folder, &of_label).ok().as_ref() != Some(&written) {
         lines += &changed_report(label, "");
     }
     if has(pdf) {
@@ -252,23 +255,31 @@ fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     }
 }
 
-/// Returns a line of text about the PDF report `name` if it differs from the report that is made from the journal now
-/// with `options`, on paper of either size.
+/// Returns a line of text about the PDF report `name` if it differs from the report that is made from the journal now, in
+/// the language of the PDF, on paper of either size, without a header or with that of `options`.
 fn pdf_text(folder: &Path, name: &str, options: &ReportOptions) -> String {
     let written = std::fs::read(folder.join(name)).unwrap_or_default();
-    let remade = Paper::ALL.map(|paper| run_report_pdf(folder, options, paper));
-    if remade.iter().any(|made| made.as_ref().is_ok_and(|made| *made == written)) {
-        return String::new();
+    let language = pdf_language(&written);
+    let headers = options.header.as_ref().map_or(vec![None], |header| vec![Some(header.clone()), None]);
+    let mut failed = None;
+    for header in headers {
+        for paper in Paper::ALL {
+            match run_report_pdf(folder, &ReportOptions { language, header: header.clone() }, paper) {
+                Ok(made) if made == written => return String::new(),
+                Ok(_) => {}
+                Err(error) => failed = Some(error),
+            }
+        }
     }
-    match remade.into_iter().find_map(Result::err) {
-        None => changed_report(name, ", or this computer has other fonts"),
+    match failed {
+        None => changed_report(name, ", its header is another one, or this computer has other fonts"),
         Some(error) => format!("report      {name} is not compared with the record: {error}\n"),
     }
 }
 
 fn changed_report(name: &str, or: &str) -> String {
     format!(
-        "report      {name} differs from the report that Regrind now makes from the record: a person changed the file, or the version of Regrind changed{or}\n"
+        "report      {name} differs from the report that Regrind now makes from the record: a person changed the file, the run went on after it was made, or the version of Regrind changed{or}\n"
     )
 }
 

@@ -58,7 +58,6 @@ pub(super) struct Show {
 struct Job {
     device: Device,
     cycle: u32,
-    total: u32,
     began: Instant,
 }
 
@@ -209,7 +208,7 @@ impl Show {
         let is_new = self.job.as_ref().is_none_or(|known| (known.device, known.cycle) != job);
         if is_new {
             self.end_job()?;
-            self.job = Some(Job { device, cycle, total, began: Instant::now() });
+            self.job = Some(Job { device, cycle, began: Instant::now() });
         }
         if let Some(bar) = &self.bar {
             bar.set_style(style("{wide_msg} [{bar:16}] {percent:>3} %"));
@@ -226,9 +225,9 @@ impl Show {
 
     /// Leaves a line about the job that is over, where a bar has shown its progress.
     fn end_job(&mut self) -> Result<(), Failure> {
-        let (Some(Job { device, cycle, total, began }), Some(_)) = (self.job.take(), &self.bar) else { return Ok(()) };
+        let (Some(Job { device, cycle, began }), Some(_)) = (self.job.take(), &self.bar) else { return Ok(()) };
         let seconds = began.elapsed().as_secs_f64();
-        self.line(&format!("cycle {cycle}: {}, {}", whole_job(device, total), time_left([seconds, seconds])))
+        self.line(&format!("cycle {cycle}: {}, {}", doing(device), time_left([seconds, seconds])))
     }
 
     fn figures(&mut self, cycle: u32, figures: &Figures) -> Result<(), Failure> {
@@ -319,6 +318,10 @@ impl Show {
             let Some((blocks, sigma)) = both else { return Ok(()) };
             let wide = blocks.rows.first().map_or(0, Vec::len) + APART;
             let known = format!("standard deviation: up to {} µm", three_digits(sigma.limit_um));
+            let known = match wide + known.chars().count() > columns() {
+                true => format!("\n{known}"),
+                false => known,
+            };
             let below = format!("{:wide$}{known}\n{falls}", error(&blocks));
             (blocks.append_right(sigma, APART), below)
         } else {
@@ -376,7 +379,7 @@ pub(super) fn print_end(folder: &Path, ending: &Ending, report: &Path) -> Result
         Ending::Stopped { .. } => ("STOPPED", "31"),
         Ending::Aborted { .. } => ("ABORTED", "31"),
     };
-    let is_terminal = io::stderr().is_terminal();
+    let is_terminal = io::stdout().is_terminal();
     let columns = if is_terminal { columns() } else { usize::MAX };
     // A report that was written can be read again.
     let lines = first_lines(folder, columns).unwrap_or_else(|_| vec![ending_words(ending)]);
@@ -394,7 +397,7 @@ fn striking(text: &str, word: &str, colour: &str) -> String {
     if !word.is_empty() && console::colors_enabled() {
         text = text.replacen(word, &format!("\x1b[1;{colour}m{word}\x1b[0m"), 1);
     }
-    let bell = if word.is_empty() { "" } else { "\x07" };
+    let bell = if word.is_empty() || !io::stdout().is_terminal() { "" } else { "\x07" };
     format!("{bell}{text}")
 }
 

@@ -188,25 +188,33 @@ impl View {
     fn draw(&self, frame: &mut Frame) {
         let alarms = self.alarms();
         let head = self.head();
+        let [wide, high] = [frame.area().width, frame.area().height].map(usize::from);
         // A line that is broken between words can need one row more than its letters.
-        let rows_of = |line: &Line| 1 + line.width().saturating_sub(1) / usize::from(frame.area().width.max(9) - 8);
+        let rows_of = |line: &Line| 1 + line.width().saturating_sub(1) / wide.max(9).saturating_sub(8);
         let head_rows: usize = head.iter().map(rows_of).sum();
+        let job_rows = if self.snapshot.progress.is_some() { 2 } else { 0 };
+        let alarm_rows: usize = alarms.lines.iter().map(rows_of).sum();
+        let cycle_rows = if self.snapshot.tolerance.is_some() { 3 + self.snapshot.cycles.len() } else { 0 };
+        // The head and the keys are always there; then come the alarms, the newest cycles, and the map.
+        let mut left = high.saturating_sub(1);
+        let mut taken = |wanted: usize| {
+            let rows = wanted.min(left);
+            left -= rows;
+            Constraint::Length(rows as u16)
+        };
         let rows = [
-            Constraint::Length(head_rows.min(5) as u16),
-            Constraint::Length(if self.snapshot.progress.is_some() { 2 } else { 0 }),
-            Constraint::Length(if alarms.lines.is_empty() { 0 } else { (alarms.lines.len() as u16 * 2).min(9) }),
-            Constraint::Length(match self.snapshot.tolerance {
-                Some(_) => 3 + self.snapshot.cycles.len() as u16,
-                None => 0,
-            }),
-            Constraint::Min(6),
+            taken(head_rows),
+            taken(job_rows),
+            taken(alarm_rows),
+            taken(cycle_rows),
+            taken(usize::MAX),
             Constraint::Length(1),
         ];
         let [top, job, alarm, figures, map, foot] = Layout::vertical(rows).areas(frame.area());
         frame.render_widget(Paragraph::new(head.to_vec()).wrap(Wrap { trim: true }), top);
         self.job(frame, job);
         frame.render_widget(Paragraph::new(alarms).wrap(Wrap { trim: true }).red(), alarm);
-        frame.render_widget(self.figures(), figures);
+        frame.render_widget(self.figures(figures), figures);
         self.maps(frame, map);
         let (message, of_state) = &self.said;
         // The hold itself brings the cell through Holding to Held.
@@ -252,26 +260,36 @@ impl View {
 
     fn alarms(&self) -> Text<'_> {
         let of = |alarm: &regrind::cell::Alarm| {
-            let remedy = alarm.remedy.iter().zip(1..).map(|(remedy, k)| format!("  {k}. {remedy}")).collect::<String>();
-            [Line::from(format!("ALARM  {}", alarm.event)).bold(), Line::from(format!("{}{remedy}", alarm.consequence))]
+            let remedy = alarm.remedy.iter().zip(1..).map(|(remedy, k)| Line::from(format!("{k}. {remedy}")));
+            let event = Line::from(format!("ALARM  {}", alarm.event)).bold();
+            [event, Line::from(alarm.consequence.clone())].into_iter().chain(remedy).collect::<Vec<_>>()
         };
         Text::from(self.snapshot.alarms.iter().flat_map(of).collect::<Vec<_>>())
     }
 
-    fn figures(&self) -> Paragraph<'_> {
+    /// Returns the table of the cycles. In a lower area it has the newest ones, and in a narrow one fewer columns.
+    fn figures(&self, area: Rect) -> Paragraph<'_> {
+        /// Columns of a row with the points and the outliers.
+        const WHOLE: u16 = 47;
         let Some(tolerance) = self.snapshot.tolerance else { return Paragraph::default() };
+        let columns = |cycle: &str, pv: &str, rms: &str, points: &str, outliers: &str| match area.width < WHOLE {
+            true => format!("{cycle:>5} {pv:>13} {rms:>8}"),
+            false => format!("{cycle:>5} {pv:>13} {rms:>8} {points:>8} {outliers:>9}"),
+        };
         let row = |row: &CycleRow| {
             let (CycleRow { cycle, points, outliers, .. }, [pv_um, rms_um]) = (row, row.judged_um());
-            Line::from(format!("{cycle:>5} {pv_um:>13.2} {rms_um:>8.3} {points:>8} {outliers:>9}"))
+            let [cycle, points, outliers] = [cycle, points, outliers].map(u32::to_string);
+            Line::from(columns(&cycle, &format!("{pv_um:.2}"), &format!("{rms_um:.3}"), &points, &outliers))
         };
         let falls = sparkline(self.snapshot.cycles.iter().map(|row| row.judged_um()[1]));
         let pv = format!("{} \u{b5}m", pv_name(&tolerance));
-        let head = Line::from(format!("cycle {pv:>13} {:>8} {:>8} {:>9}", "RMS \u{b5}m", "points", "outliers"));
+        let head = Line::from(columns("cycle", &pv, "RMS \u{b5}m", "points", "outliers"));
         let limits = Line::from(vec![
             Span::raw(format!("tolerance {}   ", limits(&tolerance))),
             Span::raw(if falls.is_empty() { String::new() } else { format!("RMS {falls}") }).cyan(),
         ]);
-        let lines = [limits, head.dim()].into_iter().chain(self.snapshot.cycles.iter().map(row));
+        let first = self.snapshot.cycles.len().saturating_sub(usize::from(area.height.saturating_sub(2)));
+        let lines = [limits, head.dim()].into_iter().chain(self.snapshot.cycles[first..].iter().map(row));
         Paragraph::new(lines.collect::<Vec<_>>())
     }
 
@@ -422,6 +440,26 @@ mod tests {
             for row in rows.iter().filter(|row| row.contains('\u{2580}')) {
                 let map = row.trim_matches(' ').split("   ").next().unwrap();
                 assert!(!map.contains(' '), "{size:?}: {row:?}");
+            }
+        }
+    }
+
+    /// The head, every step of the alarm and the newest cycle are there before the map.
+    #[test]
+    fn alarm_and_newest_cycle_come_before_the_map() {
+        let alarm: regrind::cell::Alarm = serde_json::from_value(serde_json::json!({
+            "id": "link_lost", "what": "The link to a machine is lost: CMM. ".repeat(4), "consequence": "No new step begins.",
+            "remedy": ["Check the cable.", "Compare the register map.", "Wait."], "clears": "operator" }))
+        .unwrap();
+        for size in [[60, 24], [80, 24], [120, 40]] {
+            let mut view = view("SN-9");
+            view.snapshot.alarms = vec![alarm.clone()];
+            let first = view.snapshot.cycles[0].clone();
+            view.snapshot.cycles = (1..=11).map(|cycle| CycleRow { cycle, ..first.clone() }).collect();
+            let (rows, _) = drawn(&view, size);
+            let all = rows.join("\n");
+            for words in ["SIMULATION", "next:", "1. Check the cable.", "3. Wait.", "   11         29.53", "h hold"] {
+                assert!(all.contains(words), "{words}: {size:?}\n{all}");
             }
         }
     }

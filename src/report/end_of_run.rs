@@ -9,12 +9,9 @@ use super::run::with_report;
 use super::texts::ReportText as Text;
 use regrind_cell::{ComparedFigure, Tolerance};
 
-/// Number of columns of the complete table.
-const TABLE: usize = 80;
-
 /// Verifies the record in the run folder `folder`, and returns the first lines of the report of the run: verdict with its
-/// reason, part, cycle and time, and the table of the judged figures. Only the line of the verdict can have more than
-/// `columns` characters. The table has fewer columns if `columns` is below 80.
+/// reason, part, cycle and time, and the table of the judged figures. The table has fewer columns
+/// if a line of it would have more than `columns` characters. Other lines are as long as their texts.
 ///
 /// # Errors
 /// As [`run_report`](crate::run_report).
@@ -34,7 +31,9 @@ fn lines(report: &Report, columns: usize) -> Vec<String> {
     if let (Some(tolerance), Some((_, _, figures))) = (report.story.tolerance(), report.story.last_measured()) {
         let compared = tolerance.compare(figures);
         lines.push(String::new());
-        lines.extend(if columns < TABLE { narrow(report, &compared) } else { wide(report, &compared, &tolerance) });
+        let table = wide(report, &compared, &tolerance);
+        let is_too_wide = table.iter().any(|line| line.chars().count() > columns);
+        lines.extend(if is_too_wide { narrow(report, &compared) } else { table });
     }
     lines
 }

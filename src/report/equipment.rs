@@ -111,7 +111,9 @@ pub(super) fn registered(report: &Report, cycle: u32, found: &Value, model: Opti
     let um = |mm: f64| format!("{} \u{b5}m", number(1e3 * mm, 2));
     // A locked direction has no uncertainty in one file, and 0 in the other.
     let place = |stated: &Value| {
-        let sigma = |key: &str| stated[key].as_f64().filter(|sigma| *sigma > 0.0);
+        /// A smaller value is the rounding of a locked direction, in mm or rad.
+        const LOCKED: f64 = 1e-12;
+        let sigma = |key: &str| stated[key].as_f64().filter(|sigma| *sigma > LOCKED);
         let locked = || report.say(Text::Locked).to_owned();
         let shift = ["x_mm", "y_mm", "z_mm"].map(|key| sigma(key).map_or_else(locked, um)).join("; ");
         let turn = ["rx_rad", "ry_rad", "rz_rad"]

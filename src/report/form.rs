@@ -26,9 +26,24 @@ pub(super) fn form(report: &Report, folder: &Path) -> Result<String, ReportError
         cycles.push((*number, read_figures(&folder.join(name))?));
     }
     let Some((_, last)) = cycles.last() else { return Ok(String::new()) };
+    let shown = first_and_last(&cycles);
+    let left_out = if shown.len() < cycles.len() {
+        format!("<p class=\"caption\">{}</p>\n", report.say(Text::CyclesOfTable))
+    } else {
+        String::new()
+    };
     let title = report.say(Text::FormOfSurface);
-    let html = format!("<h2>{title}</h2>\n{}{}", estimated_figures(report, &cycles, last), raw(report, &cycles, last));
+    let html =
+        format!("<h2>{title}</h2>\n{left_out}{}{}", estimated_figures(report, &shown, last), raw(report, &shown, last));
     Ok(html + &notations(report, &cycles) + &zernike(report, last))
+}
+
+/// Returns the first and the last two cycles: a page has no room for the columns of more.
+fn first_and_last(cycles: &[(u32, Value)]) -> Vec<(u32, Value)> {
+    /// Number of columns for cycles.
+    const COLUMNS: usize = 3;
+    let late = cycles.len().saturating_sub(COLUMNS - 1).max(1);
+    cycles.iter().take(1).chain(cycles.iter().skip(late)).cloned().collect()
 }
 
 /// Reads a file `figures.json`, which holds the figures of a cycle.
@@ -193,10 +208,12 @@ fn zernike(report: &Report, last: &Value) -> String {
     /// Number of coefficients side by side.
     const BESIDE: usize = 4;
     let fit = &last["zernike"];
-    let Some(radius_mm) = fit["half_size_mm"][0].as_f64().filter(|radius_mm| is_round(*radius_mm, &last["legendre"]))
-    else {
+    let Some(radius_mm) = fit["half_size_mm"][0].as_f64() else { return String::new() };
+    let centre_mm = [0, 1].map(|k| fit["centre_mm"][k].as_f64().unwrap_or(f64::NAN));
+    let has_hole = report.maps.last().is_none_or(|map| map.distance_mm(centre_mm) > 0.1 * radius_mm);
+    if has_hole || !is_round(radius_mm, &last["legendre"]) {
         return String::new();
-    };
+    }
     let um = |nm: &Value| nm.as_f64().map_or("-".to_owned(), |nm| decimal(1e-3 * nm, 4, report.language));
     let cells: Vec<String> = listed(fit, "terms")
         .iter()
@@ -232,6 +249,16 @@ fn is_round(radius_mm: f64, around: &Value) -> bool {
 mod tests {
     use super::*;
     use serde_json::json;
+
+    #[test]
+    fn tables_have_three_cycles_at_most() {
+        let numbers = |count: u32| {
+            let cycles: Vec<(u32, Value)> = (1..=count).map(|cycle| (cycle, Value::Null)).collect();
+            first_and_last(&cycles).iter().map(|(cycle, _)| *cycle).collect::<Vec<u32>>()
+        };
+        assert_eq!([1, 2, 3].map(numbers), [vec![1], vec![1, 2], vec![1, 2, 3]]);
+        assert_eq!((numbers(4), numbers(11)), (vec![1, 3, 4], vec![1, 10, 11]));
+    }
 
     #[test]
     fn only_round_parts_are_round() {

@@ -270,10 +270,13 @@ impl HeatMap {
     /// # Errors
     /// Fails if the pixels cannot be encoded.
     pub fn to_svg(&self) -> Result<String, ReportError> {
-        let lines = self.lines_within(self.size()[0] + BESIDE);
+        // A narrow map must not be narrower than its title and the mark beside it.
+        let heading = LARGE_LETTER * self.title.chars().count() as f64 + if self.is_simulated { BADGE } else { 0.0 };
+        let room = (self.size()[0] + BESIDE).max(heading);
+        let lines = self.lines_within(room);
         let frame = self.frame(lines.len());
         let ([left, top], [width, height]) = (frame.corner, frame.size);
-        let mut svg = Svg::new(left + width + BESIDE, top + height + 54.0);
+        let mut svg = Svg::new(left + room, top + height + 54.0);
         svg.text([left, 24.0], Anchor::Start, LARGE, &self.title);
         for (line, y) in lines.iter().zip((0..).map(|k| 44.0 + LINE * f64::from(k))) {
             svg.text([left, y], Anchor::Start, SMALL, line);
@@ -288,7 +291,7 @@ impl HeatMap {
             self.mark_extremes(&mut svg, &frame, Language::En);
         }
         if self.is_simulated {
-            svg.badge([left + width + BESIDE - 8.0, 24.0], "SIMULATION");
+            svg.badge([left + room - 8.0, 24.0], "SIMULATION");
         }
         Ok(svg.finish())
     }
@@ -442,14 +445,21 @@ const LINE: f64 = 18.0;
 /// Average width of a letter in those lines. It is also sufficient if a wider typeface replaces the intended one.
 const LETTER: f64 = 6.8;
 
+/// Average width of a letter of the title, and width of the mark of a simulation with the space around it.
+const LARGE_LETTER: f64 = 8.5;
+const BADGE: f64 = 126.0;
+
 /// Breaks `line` into several lines of at most `most` characters. Each break is after the last comma that is followed
 /// by a space within the first `most` characters. Without such a comma, the break is at the last space within these
-/// characters. Without such a space, the rest of the text becomes one line that is longer than `most`.
+/// characters. Without such a space, a long word is broken.
 fn broken(line: &str, most: usize) -> Vec<String> {
     let (mut lines, mut rest) = (Vec::new(), line);
     while let Some((end, _)) = rest.char_indices().nth(most) {
         let fits = &rest[..end];
-        let Some(at) = fits.rfind(", ").map(|at| at + 1).or_else(|| fits.rfind(' ')) else { break };
+        let at = fits.rfind(", ").map(|at| at + 1).or_else(|| fits.rfind(' ')).filter(|at| *at > 0).unwrap_or(end);
+        if at == 0 {
+            break;
+        }
         lines.push(rest[..at].to_owned());
         rest = rest[at..].trim_start();
     }
@@ -529,8 +539,8 @@ mod tests {
         assert_eq!(broken(line, 33), [line]);
         assert_eq!(broken(line, 32), ["PV 4.00 µm, RMS 1.29 µm,", "6 points"]);
         assert_eq!(broken(line, 12), ["PV 4.00 µm,", "RMS 1.29", "µm, 6 points"]);
-        // A text without a place to break stays whole.
-        assert_eq!((broken("unbroken", 3), broken("", 5)), (vec!["unbroken".to_owned()], vec![String::new()]));
+        // A word that is too long is broken.
+        assert_eq!((broken("unbroken", 3).concat(), broken("", 5)), ("unbroken".to_owned(), vec![String::new()]));
         let narrow = HeatMap::of_lengths("strip", "height", &SMALL_MAP).unwrap().with_max_size([10.0, 90.0]);
         let narrow = narrow.with_tolerance(1e-3).unwrap();
         let svg = narrow.to_svg().unwrap();

@@ -12,6 +12,7 @@ use super::run::with_report;
 use super::texts::ReportText as Text;
 use regrind_formats::run_files::RunFile;
 use regrind_formats::{escaped, write_atomic};
+use regrind_language::Language;
 
 /// Width and height of the label, in millimetres.
 const SIZE_MM: [f64; 2] = [80.0, 30.0];
@@ -40,7 +41,19 @@ pub fn run_label(folder: &Path, options: &ReportOptions) -> Result<String, Repor
     with_report(folder, options, label)
 }
 
+/// Begin of the comment with the language of a label.
+const LANGUAGE_MARK: &str = "<!--language:";
+
+/// Returns the language of a label from the text of its file; the default one if the text states none.
+pub fn label_language(svg: &str) -> Language {
+    let tag = svg.split(LANGUAGE_MARK).nth(1).and_then(|rest| rest.split("-->").next());
+    tag.and_then(Language::first_of).unwrap_or_default()
+}
+
 fn label(report: &Report) -> Result<String, ReportError> {
+    if report.story.home.is_some() {
+        return Err(ReportError::NoPart { run: report.run().to_owned() });
+    }
     let head = &report.verified.head;
     let content = format!("{}\n{}\n{head}", report.serial(), report.run());
     let code = QrCode::with_error_correction_level(&content, EcLevel::M)
@@ -49,7 +62,8 @@ fn label(report: &Report) -> Result<String, ReportError> {
     let mut svg = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}mm\" height=\"{height}mm\" viewBox=\"0 0 {width} {height}\" \
          font-family=\"Inter, Helvetica, Arial, sans-serif\" fill=\"#000000\">\n\
-         <rect width=\"100%\" height=\"100%\" fill=\"#ffffff\"/>\n<path d=\"{}\"/>\n",
+         {LANGUAGE_MARK}{}-->\n<rect width=\"100%\" height=\"100%\" fill=\"#ffffff\"/>\n<path d=\"{}\"/>\n",
+        report.language.tag(),
         modules(&code)
     );
     for (size, y, text) in lines(report, head) {
@@ -81,11 +95,20 @@ fn lines(report: &Report, head: &str) -> Vec<(f64, f64, String)> {
 
 /// Returns a text element. A text that would be wider than its place gets a smaller size.
 fn line(size: f64, y: f64, text: &str) -> String {
-    /// Width of an average letter of the widest of the named fonts, as a share of the size.
-    const LETTER: f64 = 0.64;
     let [left, width] = TEXT_MM;
-    let size = size.min(width / (LETTER * text.chars().count().max(1) as f64));
+    let size = size.min(width / text.chars().map(width_of).sum::<f64>().max(1.0));
     format!("<text x=\"{left}\" y=\"{y}\" font-size=\"{size:.2}\">{}</text>\n", escaped(text))
+}
+
+/// Returns the width of a letter in the widest of the named fonts, as a share of the size of the font.
+fn width_of(c: char) -> f64 {
+    match c {
+        'i' | 'j' | 'l' | '.' | ',' | ':' | ';' | ' ' | '\'' | '|' => 0.4,
+        'W' | 'M' | 'm' | 'w' | '@' | '%' => 1.0,
+        'A'..='Z' => 0.8,
+        c if u32::from(c) < 0x250 => 0.64,
+        _ => 1.05,
+    }
 }
 
 /// Returns hexadecimal digits in groups of eight.
@@ -127,7 +150,8 @@ mod tests {
     #[test]
     fn long_text_is_smaller() {
         assert!(line(5.0, 1.0, "SN-1").contains("\"5.00\""));
-        assert!(line(5.0, 1.0, &"W".repeat(40)).contains("\"1.84\""));
+        assert!(line(5.0, 1.0, &"W".repeat(40)).contains("\"1.18\""));
+        assert!(line(5.0, 1.0, &"\u{9554}".repeat(12)).contains("\"3.73\""));
         assert!(line(5.0, 1.0, "").contains("\"5.00\""));
     }
 

@@ -57,8 +57,8 @@ pub use dfq::{DfqPart, dfq_of_parts};
 pub use end_of_run::first_lines;
 pub use heat_map::HeatMap;
 pub use interval_bar::interval_bar;
-pub use label::{run_label, write_run_label};
-pub use pdf::{Paper, run_report_pdf, write_run_report_pdf};
+pub use label::{label_language, run_label, write_run_label};
+pub use pdf::{Paper, pdf_language, run_report_pdf, write_run_report_pdf};
 pub use plot::{Axis, Plot, Series};
 pub use ply::{coloured_ply, save_coloured_ply};
 pub use record_lines::{RecordChoice, RecordLine, RecordVerification, record_lines, verify_record};
@@ -110,13 +110,18 @@ pub enum ReportError {
         "run {run}: no measurement of this run could be registered, so the run has no results to write; `regrind report` shows the reason"
     )]
     NothingMeasured { run: String },
+    /// Recovery of machines, which makes no part and so has no label.
+    #[error("run {run}: this run brought machines home and made no part, so it has no label")]
+    NoPart { run: String },
     /// Label whose texts do not fit into a code.
     #[error(
         "run {run}: the label cannot be written, because its texts do not fit into a QR code: {reason}; use a shorter serial number"
     )]
     Label { run: String, reason: String },
     /// Report that cannot be laid out as PDF.
-    #[error("run {run}: the report cannot be written as PDF: {reason}; the HTML report has the same content")]
+    #[error(
+        "run {run}: the report cannot be written as PDF: {reason}; if this is about the logo, use a PNG in RGB; the HTML report has the same content"
+    )]
     Pdf { run: String, reason: String },
     /// Program that was built without the feature `pdf`.
     #[error(

@@ -51,6 +51,11 @@ impl CycleMap {
         round_limit(low.abs().max(high.abs()))
     }
 
+    /// Returns the distance of the nearest node from a place, in millimetres.
+    pub(super) fn distance_mm(&self, [x, y]: [f64; 2]) -> f64 {
+        self.samples_um.iter().map(|node| (node[0] - x).hypot(node[1] - y)).fold(f64::INFINITY, f64::min)
+    }
+
     /// Returns the map as SVG, with the colours from `-limit_um` to `limit_um`. A map that cannot be drawn, for example
     /// because it has one node only, is a paragraph with the reason.
     ///

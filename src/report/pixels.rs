@@ -10,6 +10,9 @@ use super::fonts;
 /// Pixels of a drawn figure for each pixel of its SVG, so that its letters are sharp in a document.
 const SCALE: f32 = 1.5;
 
+/// Families of fonts in the SVG of a figure, in the order in which a reader of SVG tries them.
+pub(super) const FONTS_OF_FIGURES: &str = "Helvetica, Arial, sans-serif";
+
 /// Draws an SVG on a white ground, and returns it as PNG. A character that the fonts of this program lack is drawn with
 /// a font of the computer; it is left out if there is none.
 ///
@@ -17,7 +20,8 @@ const SCALE: f32 = 1.5;
 /// Returns the reason if the SVG has a mistake, no size, or a size that no memory holds.
 pub(super) fn drawn(svg: &str) -> Result<Vec<u8>, String> {
     let options = Options { font_family: fonts::FAMILY.to_owned(), fontdb: fonts_for(svg), ..Options::default() };
-    let tree = Tree::from_str(svg, &options).map_err(|error| error.to_string())?;
+    let tree =
+        Tree::from_str(&svg.replace(FONTS_OF_FIGURES, fonts::FAMILY), &options).map_err(|error| error.to_string())?;
     let [width, height] = [tree.size().width(), tree.size().height()].map(|length| (length * SCALE).ceil() as u32);
     let mut pixmap = Pixmap::new(width, height).ok_or_else(|| format!("no room for {width} x {height} pixels"))?;
     resvg::render(&tree, Transform::from_scale(SCALE, SCALE), &mut pixmap.as_mut());
@@ -33,6 +37,8 @@ fn fonts_for(text: &str) -> Arc<fontdb::Database> {
     }
     let mut all = own_fonts();
     all.load_system_fonts();
+    // The fonts of the computer come with families of their own.
+    all.set_sans_serif_family(fonts::FAMILY);
     Arc::new(all)
 }
 
@@ -80,6 +86,24 @@ mod tests {
         assert_eq!((at(0, 0), at(89, 29)), ([255, 0, 0], [255, 255, 255]));
         let inked = (15..75).flat_map(|x| (0..30).map(move |y| (x, y))).filter(|&(x, y)| at(x, y)[0] < 128).count();
         assert!(inked > 50, "{inked} dark pixels of a text");
+    }
+
+    /// A character that the fonts lack does not change the others.
+    #[test]
+    fn unknown_character_leaves_other_text() {
+        let text = |content: &str| {
+            format!(
+                "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"120\" height=\"20\" font-family=\"{FONTS_OF_FIGURES}\">\
+                 <rect width=\"100%\" height=\"100%\" fill=\"#fff\"/><text x=\"2\" y=\"15\">SIMULATION</text><text x=\"100\" y=\"15\">{content}</text></svg>"
+            )
+        };
+        let left = |content: &str| {
+            let (width, pixels) = decoded(&drawn(&text(content)).unwrap());
+            let row = |row: &[u8]| row[..4 * 140].to_vec();
+            pixels.chunks(4 * width as usize).flat_map(row).collect::<Vec<u8>>()
+        };
+        assert!(left("") == left("\u{9554}"), "the mark is drawn alike");
+        assert!(left("").iter().filter(|value| **value < 128).count() > 300);
     }
 
     #[test]

@@ -106,12 +106,35 @@ pub fn logo_uri(bytes: &[u8]) -> Option<String> {
         [0xff, 0xd8, 0xff, ..] => "jpeg",
         _ => is_svg().map(|()| "svg+xml")?,
     };
-    (bytes.len() <= MAX_LOGO_BYTES).then(|| format!("data:image/{kind};base64,{}", STANDARD.encode(bytes)))
+    (bytes.len() <= MAX_LOGO_BYTES && (kind != "svg+xml" || is_flat(bytes)))
+        .then(|| format!("data:image/{kind};base64,{}", STANDARD.encode(bytes)))
 }
 
 fn is_picture_uri(uri: &str) -> bool {
     let kinds = ["png", "jpeg", "svg+xml"].map(|kind| format!("data:image/{kind};base64,"));
-    kinds.iter().any(|head| uri.strip_prefix(head).is_some_and(|data| STANDARD.decode(data).is_ok()))
+    let bytes = kinds.iter().find_map(|head| STANDARD.decode(uri.strip_prefix(head)?).ok());
+    bytes.is_some_and(|bytes| bytes.len() <= MAX_LOGO_BYTES && (!uri.contains("svg+xml") || is_flat(&bytes)))
+}
+
+/// Returns true if the elements of an SVG are nested at most 100 deep. The count includes tags in comments, so it can be
+/// too high, but not too low. A program that draws deeper ones can run out of its stack.
+fn is_flat(svg: &[u8]) -> bool {
+    const MAX_DEPTH: usize = 100;
+    let mut depth = 0_usize;
+    for (k, _) in svg.iter().enumerate().filter(|(_, byte)| **byte == b'<') {
+        match svg.get(k + 1) {
+            Some(b'/') => depth = depth.saturating_sub(1),
+            Some(b'!' | b'?') | None => {}
+            Some(_) => {
+                let end = svg[k..].iter().position(|byte| *byte == b'>').map_or(svg.len(), |length| k + length);
+                depth += usize::from(svg[end - 1] != b'/');
+            }
+        }
+        if depth > MAX_DEPTH {
+            return false;
+        }
+    }
+    true
 }
 
 #[cfg(test)]
@@ -147,6 +170,11 @@ mod tests {
         assert!(logo_uri(&png).unwrap().starts_with("data:image/png;base64,iVBORw0KGgo"));
         assert!(logo_uri(b"<svg xmlns='a'/>").unwrap().starts_with("data:image/svg+xml;base64,"));
         assert!(logo_uri(&[0xff, 0xd8, 0xff, 0xe0]).unwrap().starts_with("data:image/jpeg"));
+        let nested = |depth: usize| format!("<svg>{}{}</svg>", "<g>".repeat(depth), "</g>".repeat(depth)).into_bytes();
+        assert!(logo_uri(&nested(90)).is_some() && logo_uri(&nested(101)).is_none());
+        assert!(logo_uri(format!("<svg>{}</svg>", "<g a='b'/><g></g><!-- c -->".repeat(1000)).as_bytes()).is_some());
+        let uri = format!("data:image/svg+xml;base64,{}", STANDARD.encode(nested(20_000)));
+        assert!(ShopHeader { logo: Some(uri), ..header() }.check().is_err());
         assert_eq!([logo_uri(b""), logo_uri(b"GIF89a"), logo_uri(b"<html/>")], [None, None, None]);
         let mut large = png.to_vec();
         large.resize(MAX_LOGO_BYTES + 1, 0);

@@ -42,7 +42,7 @@ regrind_language::texts! {
     ReducesRmsBy ErrorLeftForMap
     // Measuring strategy and Zernike coefficients.
     MeasuringStrategy TargetsAll TargetsChosen SpherePoints ProbingSpeed ApproachDistance
-    PartTemperature Zernike ZernikeNote Residual
+    PartTemperature Zernike ZernikeNote Residual CyclesOfTable
 }
 
 /// Returns the verdict on a cycle in words.

@@ -22,13 +22,15 @@ use super::paper::Paper;
 /// Fails if no font on this computer has a character of the report.
 pub(super) fn pdf(report: &Report, html: &str, paper: Paper) -> Result<Vec<u8>, ReportError> {
     let failed = |reason: String| ReportError::Pdf { run: report.run().to_owned(), reason };
-    let markup = Markup::from_html(html).map_err(|error| failed(error.to_string()))?;
+    let markup = Markup::from_html(html, report.say(Text::AgainstLimit)).map_err(|error| failed(error.to_string()))?;
     let [left, right] = report.foot();
     let paper = match paper {
         Paper::A4 => "a4",
         Paper::Letter => "us-letter",
     };
-    let fonts = Fonts::with_characters_of(html);
+    // A logo can have text too.
+    let logos = markup.pictures.iter().filter_map(|(_, bytes)| std::str::from_utf8(bytes).ok());
+    let fonts = Fonts::with_characters_of(&logos.fold(html.to_owned(), |all, svg| all + svg));
     let names: String = fonts.families().iter().map(|name| quoted(name) + ",").collect();
     let main = format!(
         "#import \"/report.typ\": *\n#show: report.with(title: {}, language: {}, paper: {}, fonts: ({names}), \

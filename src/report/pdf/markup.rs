@@ -14,17 +14,19 @@ pub(super) struct Markup {
     pub(super) text: String,
     /// Pictures that the text names, each with its path.
     pub(super) pictures: Vec<(String, Vec<u8>)>,
+    name_of_bars: &'static str,
 }
 
 impl Markup {
-    /// Translates the HTML of a report. `html` is as [`run_report`](crate::run_report) returns it.
+    /// Translates the HTML of a report. `html` is as [`run_report`](crate::run_report) returns it. `name_of_bars` is the
+    /// alternative text of the bars of the judged figures.
     ///
     /// # Errors
     /// Fails if the HTML is not well-formed.
-    pub(super) fn from_html(html: &str) -> Result<Self, roxmltree::Error> {
+    pub(super) fn from_html(html: &str, name_of_bars: &'static str) -> Result<Self, roxmltree::Error> {
         let options = ParsingOptions { allow_dtd: true, ..ParsingOptions::default() };
         let document = Document::parse_with_options(html, options)?;
-        let mut markup = Self { text: String::new(), pictures: Vec::new() };
+        let mut markup = Self { text: String::new(), pictures: Vec::new(), name_of_bars };
         if let Some(body) = document.descendants().find(|node| node.has_tag_name("body")) {
             markup.text = markup.children(body);
         }
@@ -55,12 +57,12 @@ impl Markup {
             "svg" => self.interval_bar(node),
             "img" => self.logo(node),
             "br" => "#linebreak()".to_owned(),
-            "small" => self.call("small", node),
-            "strong" => self.call("strong", node),
-            "code" if class == "whole" => self.call("whole", node),
-            "span" if class == "whole" => self.call("box", node),
-            "code" => self.call("mono", node),
-            "span" if class == "mark" => self.call("mark", node),
+            "small" => self.call_inline("small", node),
+            "strong" => self.call_inline("strong", node),
+            "code" if class == "whole" => self.call_inline("whole", node),
+            "span" if class == "whole" => self.call_inline("box", node),
+            "code" => self.call_inline("mono", node),
+            "span" if class == "mark" => self.call_inline("mark", node),
             "footer" => self.call("closing", node),
             "div" => match class.split(' ').next().unwrap_or_default() {
                 "two" => self.call_with_elements("two", node),
@@ -79,7 +81,13 @@ impl Markup {
 
     /// Calls a function of Typst with the content of `node`.
     fn call(&mut self, function: &str, node: Node) -> String {
-        format!("#{function}[{}]\n", self.children(node).trim())
+        self.call_inline(function, node) + "\n"
+    }
+
+    /// Calls a function of Typst with the content of `node`, within a line of text. The semicolon ends the call, so that
+    /// what follows is text.
+    fn call_inline(&mut self, function: &str, node: Node) -> String {
+        format!("#{function}[{}];", self.children(node).trim())
     }
 
     /// Calls a function of Typst with the content of each element in `node`.
@@ -185,13 +193,15 @@ impl Markup {
         let caption = figure.children().find(|node| node.has_tag_name("figcaption"));
         let alt = svg.attribute("aria-label").map(str::to_owned).or_else(|| caption.map(plain)).unwrap_or_default();
         let path = self.picture(svg);
+        let is_map = class_of(figure).contains(&"map");
+        let width = if is_map { width_of_map(svg) } else { 100.0 };
         let below = caption.map_or("none".to_owned(), |caption| format!("[{}]", self.children(caption)));
-        format!("#picture({}, {}, {below})\n", quoted(&path), quoted(alt.trim()))
+        format!("#picture({}, {}, {below}, {width:.1}%)\n", quoted(&path), quoted(alt.trim()))
     }
 
     fn interval_bar(&mut self, svg: Node) -> String {
         let path = self.picture(svg);
-        format!("#bar({}, {})", quoted(&path), quoted("interval against limit"))
+        format!("#bar({}, {})", quoted(&path), quoted(self.name_of_bars))
     }
 
     /// Adds a picture with the style that its page gives it, and returns its path.
@@ -222,6 +232,15 @@ impl Markup {
     }
 }
 
+/// Returns the width of a map as a share of its column, in per cent: a map that is tall at the full width would leave no
+/// room for the rest of its page.
+fn width_of_map(svg: Node) -> f64 {
+    /// Largest height of a map, as a share of the width of its column.
+    const MAX_HEIGHT: f64 = 0.5;
+    let length = |key: &str| svg.attribute(key).and_then(|value| value.parse::<f64>().ok()).unwrap_or(1.0);
+    (100.0 * MAX_HEIGHT * length("width") / length("height")).min(100.0)
+}
+
 fn rows<'a, 'd: 'a>(table: Node<'a, 'd>) -> impl Iterator<Item = Node<'a, 'd>> {
     table.descendants().filter(|node| node.has_tag_name("tr"))
 }
@@ -240,7 +259,9 @@ fn class_of<'a>(node: Node<'a, '_>) -> Vec<&'a str> {
 
 /// Returns true if the text of a cell stays on one line.
 fn is_short(cell: Node) -> bool {
-    class_of(cell).iter().any(|class| ["n", "t"].contains(class))
+    /// A longer text would leave no room for the other columns.
+    const MAX_LETTERS: usize = 40;
+    class_of(cell).iter().any(|class| ["n", "t"].contains(class)) && letters(cell) <= MAX_LETTERS
 }
 
 fn plain(node: Node) -> String {
@@ -251,7 +272,8 @@ fn letters(cell: Node) -> usize {
     plain(cell).chars().count()
 }
 
-/// Writes a text as a string, in which Typst sees no markup. White space in a row becomes one blank.
+/// Writes a text in strings, in which Typst sees no markup. White space in a row becomes one blank. A long word can be
+/// broken between its strings, which adds no character to the text of the PDF.
 fn words(text: &str) -> String {
     let mut one_blank = String::new();
     for c in text.chars() {
@@ -264,8 +286,33 @@ fn words(text: &str) -> String {
         "" => String::new(),
         // Between elements.
         " " => " ".to_owned(),
-        text => format!("#{}", quoted(text)),
+        text => text.split_inclusive(' ').map(word).collect(),
     }
+}
+
+/// Writes a word with the blank after it.
+fn word(word: &str) -> String {
+    /// Letters of the longest word that is never broken, and of the pieces of a longer one.
+    const WHOLE: usize = 20;
+    const PIECE: usize = 4;
+    let letters: Vec<char> = word.chars().collect();
+    // A unit is not broken at its stroke.
+    if let Some(after) = word.strip_prefix("mm/s") {
+        return format!(
+            "#box({});{}",
+            quoted("mm/s"),
+            if after.is_empty() { String::new() } else { plain_word(after) }
+        );
+    }
+    if letters.len() <= WHOLE {
+        return plain_word(word);
+    }
+    let pieces: Vec<String> = letters.chunks(PIECE).map(|piece| plain_word(&String::from_iter(piece))).collect();
+    pieces.join("#h(0.01pt);")
+}
+
+fn plain_word(word: &str) -> String {
+    format!("#{};", quoted(word))
 }
 
 /// Writes a text as a string of Typst.
@@ -274,8 +321,6 @@ pub(super) fn quoted(text: &str) -> String {
     for c in text.chars() {
         match c {
             '"' | '\\' => quoted.extend(['\\', c]),
-            // A long name may be broken here.
-            '_' if text.len() > 40 => quoted.extend([c, '\u{200b}']),
             c if c.is_control() => {}
             c => quoted.push(c),
         }

@@ -25,6 +25,7 @@ use super::report_content::ReportOptions;
 use super::run::{html, with_report};
 use regrind_formats::run_files::RunFile;
 use regrind_formats::write_atomic;
+use regrind_language::Language;
 
 /// Verifies the record in the run folder `folder`, writes the report of the run as PDF to `path`, or to
 /// `report.pdf` in this folder, and returns the path.
@@ -50,6 +51,15 @@ pub fn write_run_report_pdf(
 /// computer has a character of the report, or if this program was built without the feature `pdf`.
 pub fn run_report_pdf(folder: &Path, options: &ReportOptions, paper: Paper) -> Result<Vec<u8>, ReportError> {
     with_report(folder, options, |report| pdf(report, &html(report, folder)?, paper))
+}
+
+/// Returns the language that a PDF states, from the bytes of its file; the default one if it states none.
+pub fn pdf_language(pdf: &[u8]) -> Language {
+    const MARK: &[u8] = b"/Lang";
+    let at = pdf.windows(MARK.len()).position(|bytes| bytes == MARK).map(|at| at + MARK.len());
+    let tag = at.and_then(|at| pdf.get(at..at + 16)).map(|bytes| String::from_utf8_lossy(bytes).into_owned());
+    let tag = tag.as_deref().and_then(|text| text.split(['(', ')']).nth(1));
+    tag.and_then(Language::first_of).unwrap_or_default()
 }
 
 #[cfg(not(feature = "pdf"))]
