@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 /// Folders of sources, with the number of banned types, banned functions and banned first words that each still has.
 /// Lower a number when it falls; never raise one.
-const ALLOWED: [(&str, [usize; 3]); 24] = [
+const ALLOWED: [(&str, [usize; 3]); 25] = [
     ("src/cell", [0, 0, 0]),
     ("src/cli", [0, 0, 0]),
     ("src/config", [0, 0, 0]),
@@ -25,6 +25,7 @@ const ALLOWED: [(&str, [usize; 3]); 24] = [
     ("src/live", [0, 0, 0]),
     ("src/page", [0, 0, 0]),
     ("src/plant", [0, 0, 0]),
+    ("src/python", [0, 0, 0]),
     ("src/recipe", [0, 0, 0]),
     ("src/record", [0, 0, 0]),
     ("src/report", [0, 0, 0]),
