@@ -30,6 +30,20 @@ pub(crate) fn rows<'py>(given: &Bound<'py, PyAny>, name: &str) -> PyResult<PyArr
     array.extract().map_err(|error: PyErr| wrong(format!("cannot be read ({error})")))
 }
 
+/// Reads an argument as an array with one axis, as [`rows`] reads one with two.
+///
+/// # Errors
+/// As [`rows`].
+pub(crate) fn column(given: &Bound<PyAny>, name: &str) -> PyResult<Vec<f64>> {
+    let numpy = given.py().import("numpy")?;
+    let column = numpy.call_method1("asarray", (given,)).and_then(|array| array.call_method1("reshape", ((-1, 1),)));
+    let is_flat = numpy.call_method1("ndim", (given,)).and_then(|axes| axes.extract::<usize>());
+    match (column, is_flat) {
+        (Ok(column), Ok(1)) => Ok(rows(&column, name)?.as_array().iter().copied().collect()),
+        _ => Err(DataError::new_err(format!("{name} must be an array of real numbers with one axis: (N,)"))),
+    }
+}
+
 /// Reads an argument as points: an array with one row of x, y, z for each, in mm.
 ///
 /// # Errors

@@ -10,6 +10,7 @@
 
 mod arrays;
 mod errors;
+mod figures;
 mod form;
 mod nominal;
 mod registration;
@@ -25,6 +26,13 @@ fn _regrind(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<registration::PyRegistration>()?;
     module.add_class::<form::PyForm>()?;
     module.add_class::<form::PyInterval>()?;
+    module.add_class::<figures::PyErrorMap>()?;
+    module.add_class::<figures::PyIso10110>()?;
+    module.add_class::<figures::PyPolynomialFit>()?;
+    module.add_function(wrap_pyfunction!(figures::error_map, module)?)?;
+    module.add_function(wrap_pyfunction!(figures::gaussian, module)?)?;
+    module.add_function(wrap_pyfunction!(figures::iso10110, module)?)?;
+    module.add_function(wrap_pyfunction!(figures::zernike_fit, module)?)?;
     module.add_function(wrap_pyfunction!(registration::register, module)?)?;
     module.add_function(wrap_pyfunction!(form::model, module)?)?;
     module.add_function(wrap_pyfunction!(nominal::read_points, module)?)

@@ -40,7 +40,11 @@ const ARROWS: [(&str, &str, &[&str]); 28] = [
         "src/report",
         &["cell", "document", "journal", "formats", "geometry", "language", "record", "registration"],
     ),
-    ("python", "src/python", &["figures", "formats", "geometry", "model", "registration", "surface"]),
+    (
+        "python",
+        "src/python",
+        &["figures", "formats", "geometry", "surface", "registration", "compensation", "form", "model"],
+    ),
     ("page", "src/page", &["cell", "control", "document", "formats", "language", "report"]),
     (
         "drive",
