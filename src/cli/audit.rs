@@ -5,6 +5,7 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
+use regrind::formats::result::read_bytes;
 use regrind::formats::run_files::RunFile;
 use regrind::journal::{
     Anchor, DATABASE, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Verified, verify_against,
@@ -227,7 +228,10 @@ fn is_folder_of_runs(folder: &Path) -> bool {
 fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     let made = [RunFile::Report, RunFile::PdfReport, RunFile::Label].map(RunFile::name);
     let [html, pdf, label] = made;
-    let text = std::fs::read_to_string(folder.join(html)).unwrap_or_default();
+    let has = |name: &str| unrecorded.iter().any(|found| found == name);
+    // A pipe or a device is no file, and is not listed.
+    let read = |name: &str| if has(name) { read_bytes(&folder.join(name)).unwrap_or_default() } else { Vec::new() };
+    let text = String::from_utf8_lossy(&read(html)).into_owned();
     let options = report_options(&text).unwrap_or_default();
     // The header of a shop is in the file of the report alone, so anybody can change it.
     let mut lines = options.header.as_ref().map_or(String::new(), |header| {
@@ -236,17 +240,16 @@ fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
             "header      of {html}: {name}; its name, address, logo and fields are not in the record, so not verified\n"
         )
     });
-    let has = |name: &str| unrecorded.iter().any(|found| found == name);
     if has(html) && run_report(folder, &options).ok().as_ref() != Some(&text) {
         lines += &changed_report(html, "");
     }
-    let written = std::fs::read_to_string(folder.join(label)).unwrap_or_default();
+    let written = String::from_utf8_lossy(&read(label)).into_owned();
     let of_label = ReportOptions { language: label_language(&written), header: None };
     if has(label) && run_label(folder, &of_label).ok().as_ref() != Some(&written) {
         lines += &changed_report(label, "");
     }
     if has(pdf) {
-        lines += &pdf_text(folder, pdf, &options);
+        lines += &pdf_text(folder, pdf, &read(pdf), &options);
     }
     let others: Vec<&str> = unrecorded.iter().map(String::as_str).filter(|name| !made.contains(name)).collect();
     match others.len() {
@@ -255,11 +258,10 @@ fn unrecorded_text(folder: &Path, unrecorded: &[String]) -> String {
     }
 }
 
-/// Returns a line of text about the PDF report `name` if it differs from the report that is made from the journal now, in
+/// Returns a line of text about the PDF report `name` if its content `written` differs from the report that is made from the journal now, in
 /// the language of the PDF, on paper of either size, without a header or with that of `options`.
-fn pdf_text(folder: &Path, name: &str, options: &ReportOptions) -> String {
-    let written = std::fs::read(folder.join(name)).unwrap_or_default();
-    let language = pdf_language(&written);
+fn pdf_text(folder: &Path, name: &str, written: &[u8], options: &ReportOptions) -> String {
+    let language = pdf_language(written);
     let headers = options.header.as_ref().map_or(vec![None], |header| vec![Some(header.clone()), None]);
     let mut failed = None;
     for header in headers {

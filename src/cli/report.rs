@@ -81,7 +81,11 @@ fn shop_header(path: &Path) -> Result<ShopHeader, Failure> {
         let picture = picture.map_err(|error| wrong(format!("the logo {}: {error}", logo.display())))?;
         let uri = logo_uri(&picture);
         header.logo = Some(uri.ok_or_else(|| {
-            wrong(format!("the logo {} is no PNG, JPEG or SVG of at most {} KiB", logo.display(), MAX_LOGO_BYTES >> 10))
+            wrong(format!(
+                "the logo {} must be a PNG, a JPEG or an SVG of at most {} KiB; an SVG must have at most 128 elements within each other, 64 references and no entities; if it has more, export it as PNG",
+                logo.display(),
+                MAX_LOGO_BYTES >> 10
+            ))
         })?);
     }
     header.check().map_err(wrong)?;

@@ -110,7 +110,7 @@ fn as_json(run: &Listed) -> Value {
         .map(|of| {
             let [pv, rms] = of.figures.map_or([[None; 2]; 2], |figures| figures.map(|figure| figure.map(Some)));
             json!({
-                "cycle": of.cycle, "verdict": of.verdict, "reason": of.reason,
+                "cycle": of.cycle, "verdict": of.recorded_verdict(), "reason": of.reason,
                 "pv_um": pv[0], "pv_expanded_um": pv[1], "rms_um": rms[0], "rms_expanded_um": rms[1],
             })
         })

@@ -76,6 +76,7 @@ pub use unit::Unit;
 pub use uploaded_file::UploadedFile;
 pub use whole::read_whole;
 pub use x3p::{MapRecord, X3pFile, escaped, parse_x3p, read_x3p, write_error_map_x3p, write_x3p};
+pub use xml::is_bounded_xml;
 
 use height_map::MapFormat;
 use layout::is_separator_line;

@@ -55,6 +55,12 @@ pub(super) fn beyond_bounds(text: &str) -> Option<Beyond> {
     None
 }
 
+/// Returns true if a text exceeds none of the limits for XML documents that are read here: 256 attributes of an element,
+/// 64 declarations of namespaces, 128 elements within each other. The text need not be valid XML.
+pub fn is_bounded_xml(text: &str) -> bool {
+    beyond_bounds(text).is_none()
+}
+
 /// Start tag of an element.
 struct Tag {
     /// Position of its end.

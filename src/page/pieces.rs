@@ -425,7 +425,7 @@ fn standing(
 
 /// Returns the decision on a cycle in words; the reason why there is none, if it was not judged.
 fn decision(of: &CycleSummary, language: Language) -> String {
-    of.decision.map_or_else(|| of.reason.clone(), |decision| verdict_in_words(decision, language))
+    of.verdict.map_or_else(|| of.reason.clone(), |verdict| verdict_in_words(verdict, language))
 }
 
 /// Returns the HTML of the last judged figures: PV and RMS, each as a number with its uncertainty and its limit, and as

@@ -11,6 +11,7 @@ use maud::{DOCTYPE, Markup, html};
 use regrind_cell::{Device, StateName};
 use regrind_control::{NextStep, Snapshot};
 use regrind_formats::operator_step::StepConfirmation;
+use regrind_formats::result::read_bytes;
 use regrind_formats::run_files::RunFile;
 use regrind_report::{ColourMap, ReportOptions, RunResult, report_options};
 use serde::Deserialize;
@@ -432,7 +433,7 @@ pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, h
     let Some(folder) = page.history.folder(&id) else { return not_here(PageSubject::Cell, &headers) };
     let language = language(&headers);
     let read = spawn_blocking(move || {
-        let file = std::fs::read(folder.join(RunFile::Report.name())).ok();
+        let file = read_bytes(&folder.join(RunFile::Report.name())).ok();
         let options = file.as_ref().and_then(|html| report_options(&String::from_utf8_lossy(html))).unwrap_or_default();
         let is_wanted = options.language == language;
         match file.filter(|_| is_wanted) {

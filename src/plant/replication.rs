@@ -388,7 +388,7 @@ pub fn run_overview(folder: &Path) -> Result<Value, PlantError> {
         let [[pv, pv_u], [rms, rms_u]] = of.figures.map_or([[None; 2]; 2], |figures| figures.map(|of| of.map(Some)));
         let [expected_pv, expected_rms] = of.expected.map_or([None; 2], |of| of.map(Some));
         json!({
-            "cycle": of.cycle, "verdict": of.verdict, "reason": of.reason, "pv_um": pv, "pv_u_um": pv_u, "rms_um": rms, "rms_u_um": rms_u,
+            "cycle": of.cycle, "verdict": of.recorded_verdict(), "reason": of.reason, "pv_um": pv, "pv_u_um": pv_u, "rms_um": rms, "rms_u_um": rms_u,
             "expected_pv_um": expected_pv, "expected_rms_um": expected_rms, "map": of.map,
         })
     });

@@ -126,7 +126,7 @@ pub(super) fn registered(report: &Report, cycle: u32, found: &Value, model: Opti
     let points = |key: &str| found[key].as_f64().map_or("-".to_owned(), |n| format!("{n:.0}"));
     let fit = format!(
         "{converged}, {}: {}; {} / {} {}; {} {}; {} {}; {} % {}; RMS {}",
-        report.say(Text::Steps),
+        report.say(Text::Iterations),
         points("iterations"),
         points("used"),
         points("points"),

@@ -32,14 +32,20 @@ pub(super) fn drawn(svg: &str) -> Result<Vec<u8>, String> {
 /// characters.
 fn fonts_for(text: &str) -> Arc<fontdb::Database> {
     static OWN: LazyLock<Arc<fontdb::Database>> = LazyLock::new(|| Arc::new(own_fonts()));
+    static ALL: LazyLock<Arc<fontdb::Database>> = LazyLock::new(|| Arc::new(all_fonts()));
     if fonts::have_all(text) {
         return Arc::clone(&OWN);
     }
+    Arc::clone(&ALL)
+}
+
+/// Returns the fonts of this program and of the computer.
+fn all_fonts() -> fontdb::Database {
     let mut all = own_fonts();
     all.load_system_fonts();
     // The fonts of the computer come with families of their own.
     all.set_sans_serif_family(fonts::FAMILY);
-    Arc::new(all)
+    all
 }
 
 fn own_fonts() -> fontdb::Database {

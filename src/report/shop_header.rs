@@ -5,7 +5,7 @@ use base64::engine::general_purpose::STANDARD;
 use regrind_document::misleading;
 use serde::{Deserialize, Serialize};
 
-use regrind_formats::escaped;
+use regrind_formats::{escaped, is_bounded_xml};
 
 /// Maximum size of the picture of a logo, in bytes.
 pub const MAX_LOGO_BYTES: usize = 512 << 10;
@@ -116,25 +116,15 @@ fn is_picture_uri(uri: &str) -> bool {
     bytes.is_some_and(|bytes| bytes.len() <= MAX_LOGO_BYTES && (!uri.contains("svg+xml") || is_flat(&bytes)))
 }
 
-/// Returns true if the elements of an SVG are nested at most 100 deep. The count includes tags in comments, so it can be
-/// too high, but not too low. A program that draws deeper ones can run out of its stack.
+/// Returns true if a program can draw an SVG within its stack: its elements are not nested deeply, no entity hides others,
+/// and at most 64 references lead from one element to another.
 fn is_flat(svg: &[u8]) -> bool {
-    const MAX_DEPTH: usize = 100;
-    let mut depth = 0_usize;
-    for (k, _) in svg.iter().enumerate().filter(|(_, byte)| **byte == b'<') {
-        match svg.get(k + 1) {
-            Some(b'/') => depth = depth.saturating_sub(1),
-            Some(b'!' | b'?') | None => {}
-            Some(_) => {
-                let end = svg[k..].iter().position(|byte| *byte == b'>').map_or(svg.len(), |length| k + length);
-                depth += usize::from(svg[end - 1] != b'/');
-            }
-        }
-        if depth > MAX_DEPTH {
-            return false;
-        }
-    }
-    true
+    const MAX_REFERENCES: usize = 64;
+    let Ok(text) = std::str::from_utf8(svg) else { return false };
+    let text = text.to_ascii_lowercase();
+    // A character can be written by its number, so each number counts as well.
+    let references: usize = ["url(", "href", "&#"].iter().map(|mark| text.matches(mark).count()).sum();
+    !text.contains("<!entity") && references <= MAX_REFERENCES && is_bounded_xml(&text)
 }
 
 #[cfg(test)]
@@ -171,8 +161,20 @@ mod tests {
         assert!(logo_uri(b"<svg xmlns='a'/>").unwrap().starts_with("data:image/svg+xml;base64,"));
         assert!(logo_uri(&[0xff, 0xd8, 0xff, 0xe0]).unwrap().starts_with("data:image/jpeg"));
         let nested = |depth: usize| format!("<svg>{}{}</svg>", "<g>".repeat(depth), "</g>".repeat(depth)).into_bytes();
-        assert!(logo_uri(&nested(90)).is_some() && logo_uri(&nested(101)).is_none());
-        assert!(logo_uri(format!("<svg>{}</svg>", "<g a='b'/><g></g><!-- c -->".repeat(1000)).as_bytes()).is_some());
+        assert!(logo_uri(&nested(90)).is_some() && logo_uri(&nested(200)).is_none());
+        assert!(logo_uri(format!("<svg>{}</svg>", "<g a='>'/><g></g><!-- <g> -->".repeat(1000)).as_bytes()).is_some());
+        let hidden =
+            format!("<!DOCTYPE svg [<!ENTITY a \"{}{}\">]><svg>&a;</svg>", "<g>".repeat(200), "</g>".repeat(200));
+        assert_eq!(logo_uri(format!("<?xml version=\"1.0\"?>{hidden}").as_bytes()), None);
+        let chain =
+            |count: usize| format!("<svg>{}</svg>", "<use href='#a'/><g fill='url(#b)'/>".repeat(count)).into_bytes();
+        assert!(logo_uri(&chain(32)).is_some() && logo_uri(&chain(33)).is_none());
+        assert_eq!(logo_uri(format!("<svg>{}</svg>", "<g fill='u&#114;l(#b)'/>".repeat(65)).as_bytes()), None);
+        // Tags in comments and strokes in attributes close nothing.
+        for opened in ["<g><!--</g>-->", "<g a=\"/>\">", "<g><![CDATA[</g>]]>"] {
+            let svg = format!("<svg>{}{}</svg>", opened.repeat(150), "</g>".repeat(150));
+            assert!(logo_uri(svg.as_bytes()).is_none(), "{opened}");
+        }
         let uri = format!("data:image/svg+xml;base64,{}", STANDARD.encode(nested(20_000)));
         assert!(ShopHeader { logo: Some(uri), ..header() }.check().is_err());
         assert_eq!([logo_uri(b""), logo_uri(b"GIF89a"), logo_uri(b"<html/>")], [None, None, None]);

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::ReportError;
 use super::run_history::{AlarmHistory, CycleHistory, HoldOrder, RunHistory};
-use super::words::{ending_words, home_words, verdict_words};
+use super::words::{ending_words, home_words, recorded_name};
 use regrind_cell::{Ending, Tolerance, Verdict};
 use regrind_journal::{Reader, Record};
 use regrind_record::PassFigures;
@@ -93,9 +93,7 @@ pub struct CycleSummary {
     /// Number of the cycle, from 1.
     pub cycle: u32,
     /// Verdict; `None` if the cycle was not judged.
-    pub verdict: Option<String>,
-    /// The same verdict, for words in another language.
-    pub decision: Option<Verdict>,
+    pub verdict: Option<Verdict>,
     /// Reason for the verdict.
     pub reason: String,
     /// PV and RMS, each with its expanded uncertainty, as they were judged; `None` if nothing was measured.
@@ -113,6 +111,14 @@ pub struct CycleSummary {
     pub pass: Option<PassFigures>,
     /// Error of the probe's radius on the reference sphere; `None` if it was not measured.
     pub radius_error_um: Option<f64>,
+}
+
+impl CycleSummary {
+    /// Returns the verdict as it is recorded, in lower-case words such as "wrong response"; `None` if the cycle was not
+    /// judged.
+    pub fn recorded_verdict(&self) -> Option<String> {
+        self.verdict.as_ref().map(recorded_name)
+    }
 }
 
 /// Reads the record in the run folder `folder`, without verifying it, and returns its summary for a list of runs.
@@ -181,8 +187,7 @@ fn cycle_summary(cycle: u32, story: &CycleHistory, tolerance: Option<&Tolerance>
     });
     CycleSummary {
         cycle,
-        verdict: judgement.map(verdict_words),
-        decision: judgement.map(|judgement| judgement.verdict),
+        verdict: judgement.map(|judgement| judgement.verdict),
         reason: judgement.map_or_else(unusable, |judgement| judgement.reason.clone()),
         figures,
         left_out: last.and_then(|of| of.figures.as_ref()?.with_outliers.as_ref()).map(|of| of.description.clone()),

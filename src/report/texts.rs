@@ -30,7 +30,7 @@ regrind_language::texts! {
     Cell Machines Cycles Points Outliers Coverage Level Judged
     OrdersAndConfirmations Raised Withdrawn NotWithdrawn ClearedBy NoAlarm NoOrder Given By Order
     Answer Identity HashOfLast Traceability NominalSurface
-    Registration Fit Converged NotConverged Steps PointsUsed PointsOffPart SurfaceCovered Repeatability
+    Registration Fit Converged NotConverged Iterations PointsUsed PointsOffPart SurfaceCovered Repeatability
     FrameUncertainty Remarks Shift Rotation Locked NotOnRecord OtherPoses Budget Source ShareOfRms ShareOfPv
     NotStated Combined SquaresAddUp SourceScatter SourceForm SourcePose SourceRadius SourceScales SourceSquareness
     SourceProbe SourceTemperature SourceDatum FormOfSurface RawLastCycle Unit Meaning RawAsMeasured FormNote

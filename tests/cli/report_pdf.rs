@@ -76,6 +76,11 @@ fn shipped_part_has_four_pages_with_the_figures_of_the_results() {
         let (code, said, _) = run(&["audit", "verify", folder.to_str().unwrap()], home.path());
         assert!(code == 0 && !said.contains("report.pdf"), "{said}");
     }
+    // A PDF and a label are compared in their own language, whatever the language of the report beside them.
+    run(&["report", folder.to_str().unwrap(), "--pdf", "--label", "--language", "de"], home.path());
+    run(&["report", folder.to_str().unwrap()], home.path());
+    let (_, said, _) = run(&["audit", "verify", folder.to_str().unwrap()], home.path());
+    assert!(!said.contains("differs"), "{said}");
     let pdf = folder.join("report.pdf");
     let mut bytes = fs::read(&pdf).unwrap();
     bytes.push(b'\n');
@@ -118,6 +123,31 @@ fn assert_pages(pages: &[String], folder: &Path) {
     for (k, page) in pages.iter().enumerate() {
         assert!(page.contains(&format!("SN-7 \u{b7} SIMULATION \u{b7} page {} of {}", k + 1, pages.len())), "{page}");
     }
+}
+
+/// A logo as deep as it may be, each of its 63 patterns drawn within the one before it.
+#[test]
+fn deep_logo_is_drawn_or_refused() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e5).display().to_string();
+    assert_eq!(run(&["run", &recipe], home.path()).0, 0);
+    fs::write(home.path().join("shop.toml"), "name = \"Optics\"\nlogo = \"logo.svg\"\n").unwrap();
+    let [open, close] = ["<g opacity=\".9\">".repeat(120), "</g>".repeat(120)];
+    let mut code_of = |patterns: usize| {
+        let pattern = |k: usize| {
+            let next = k + 1;
+            format!(
+                "<pattern id=\"p{k}\" width=\"1\" height=\"1\">{open}<path d=\"M0 0h9v9z\" fill=\"url(#p{next})\"/>{close}</pattern>"
+            )
+        };
+        let patterns: String = (0..patterns).map(pattern).collect();
+        let svg = format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"10\" height=\"10\">{patterns}<path d=\"M0 0h9v9z\" fill=\"url(#p0)\"/></svg>"
+        );
+        fs::write(home.path().join("logo.svg"), svg).unwrap();
+        run(&["report", "--pdf", "--header", "shop.toml"], home.path()).0
+    };
+    assert_eq!([code_of(63), code_of(64)], [0, 2]);
 }
 
 /// Another program reads the code of the label, drawn as a printer with 300 dots an inch would print it.

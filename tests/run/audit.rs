@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::program::{only_run, regrind, root, run, run_folders, small_recipe};
+use crate::program::{Running, only_run, regrind, root, run, run_folders, small_recipe};
 use regrind::cell::{
     Actor, Alarm, AlarmId, Command as Order, Device, Ending, Event, Figures, Judgement, Occupation, Role, Verdict,
     transition_table,
@@ -182,6 +182,22 @@ fn audit_detects_missing_anchor_or_end() {
     drop(database);
     fs::write(folder.join("journal.anchor"), json!({ "records": 12, "head": head }).to_string()).unwrap();
     assert!(refused(home.path(), &["audit", "verify"], 1).contains("the run was interrupted"));
+}
+
+/// A pipe in place of a report has no end. `audit verify` does not wait for it, and still proves the record.
+#[cfg(unix)]
+#[test]
+fn audit_does_not_wait_for_pipes() {
+    let (home, folder) = recorded(true);
+    for name in ["report.html", "report.pdf", "label.svg"] {
+        let pipe = folder.join(name);
+        let _ = fs::remove_file(&pipe);
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let mut verifying = Running::new(regrind(&["audit", "verify"], home.path()));
+        verifying.line("the record", |line| line.starts_with("sound"));
+        assert_eq!(verifying.end().0, 0, "{name}");
+        fs::remove_file(&pipe).unwrap();
+    }
 }
 
 #[test]

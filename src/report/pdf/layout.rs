@@ -1,5 +1,6 @@
 //! Pages of a PDF report, laid out by Typst.
 
+use rayon::ThreadPoolBuilder;
 use typst::diag::{FileError, FileResult, SourceDiagnostic};
 use typst::foundations::{Bytes, Datetime, Smart};
 use typst::layout::PagedDocument;
@@ -15,6 +16,13 @@ use super::super::texts::ReportText as Text;
 use super::fonts::Fonts;
 use super::markup::{Markup, quoted};
 use super::paper::Paper;
+
+/// Stack of the thread that lays out a report. The SVG of a logo is drawn by recursion: a chain of 120 patterns needs more
+/// than the usual 2 MB. The limits of [`ShopHeader`] for elements within each other and for references keep it within
+/// this stack. The system gives only the part that is used.
+///
+/// [`ShopHeader`]: super::super::shop_header::ShopHeader
+const STACK_BYTES: usize = 512 << 20;
 
 /// Lays out the report `html` on pages, and returns them as PDF/A-2b. `report` is the content of the same report.
 ///
@@ -45,10 +53,6 @@ pub(super) fn pdf(report: &Report, html: &str, paper: Paper) -> Result<Vec<u8>, 
         markup.text
     );
     let desk = Desk::new(main, markup.pictures, fonts);
-    let told = |errors: &[SourceDiagnostic]| {
-        failed(errors.iter().map(|error| error.message.to_string()).collect::<Vec<_>>().join("; "))
-    };
-    let document: PagedDocument = typst::compile(&desk).output.map_err(|errors| told(&errors))?;
     let at = report.story.end.as_ref().map_or(&report.story.last, |end| &end.utc);
     let options = PdfOptions {
         ident: Smart::Custom(&report.verified.head),
@@ -56,7 +60,15 @@ pub(super) fn pdf(report: &Report, html: &str, paper: Paper) -> Result<Vec<u8>, 
         standards: PdfStandards::new(&[PdfStandard::A_2b]).map_err(|error| failed(error.to_string()))?,
         ..PdfOptions::default()
     };
-    typst_pdf::pdf(&document, &options).map_err(|errors| told(&errors))
+    let told = |errors: &[SourceDiagnostic]| {
+        errors.iter().map(|error| error.message.to_string()).collect::<Vec<_>>().join("; ")
+    };
+    let made = || {
+        let document: PagedDocument = typst::compile(&desk).output.map_err(|errors| told(&errors))?;
+        typst_pdf::pdf(&document, &options).map_err(|errors| told(&errors))
+    };
+    let thread = ThreadPoolBuilder::new().num_threads(1).stack_size(STACK_BYTES).build();
+    thread.map_err(|error| failed(error.to_string()))?.install(made).map_err(failed)
 }
 
 /// Reads a time in UTC in the format RFC 3339, to the second.

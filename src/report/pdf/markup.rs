@@ -290,12 +290,12 @@ fn words(text: &str) -> String {
     }
 }
 
-/// Writes a word with the blank after it.
+/// Writes a word with the blank after it. A long one is written in pieces, between which it can be broken. Letters of
+/// scripts whose signs join or need no blanks stay together.
 fn word(word: &str) -> String {
-    /// Letters of the longest word that is never broken, and of the pieces of a longer one.
+    /// Letters of the longest word in one piece, and of a piece of a longer one.
     const WHOLE: usize = 20;
     const PIECE: usize = 4;
-    let letters: Vec<char> = word.chars().collect();
     // A unit is not broken at its stroke.
     if let Some(after) = word.strip_prefix("mm/s") {
         return format!(
@@ -304,11 +304,20 @@ fn word(word: &str) -> String {
             if after.is_empty() { String::new() } else { plain_word(after) }
         );
     }
-    if letters.len() <= WHOLE {
+    if word.chars().count() <= WHOLE {
         return plain_word(word);
     }
-    let pieces: Vec<String> = letters.chunks(PIECE).map(|piece| plain_word(&String::from_iter(piece))).collect();
-    pieces.join("#h(0.01pt);")
+    let mut pieces = vec![String::new()];
+    let mut before = None;
+    for c in word.chars() {
+        let piece = pieces.last().map_or(0, |piece| piece.chars().count());
+        if piece >= PIECE && c.is_ascii() && before.is_some_and(|before: char| before.is_ascii()) {
+            pieces.push(String::new());
+        }
+        pieces.last_mut().expect("there is a piece").push(c);
+        before = Some(c);
+    }
+    pieces.iter().map(|piece| plain_word(piece)).collect::<Vec<_>>().join("#h(0.01pt);")
 }
 
 fn plain_word(word: &str) -> String {
@@ -326,4 +335,24 @@ pub(super) fn quoted(text: &str) -> String {
         }
     }
     quoted + "\""
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_are_strings_without_markup() {
+        assert_eq!(words("a #b\\ \"c\"\n  d"), "#\"a \";#\"#b\\\\ \";#\"\\\"c\\\" \";#\"d\";");
+        assert_eq!((words(""), words(" \n ")), (String::new(), " ".to_owned()));
+        assert_eq!(words("5 mm/s; 2"), "#\"5 \";#box(\"mm/s\");#\"; \";#\"2\";");
+    }
+
+    /// A word of 24 letters has six pieces of four. No sign of a joining script is cut from its neighbour.
+    #[test]
+    fn long_words_have_places_to_break() {
+        assert_eq!(words(&"abcd".repeat(5)).matches("#h").count(), 0);
+        assert_eq!(words(&"abcd".repeat(6)).matches("#h").count(), 5);
+        assert_eq!(words(&"\u{628}".repeat(30)).matches("#h").count(), 0);
+    }
 }
