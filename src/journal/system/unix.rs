@@ -314,7 +314,13 @@ impl LockFile {
     /// Returns the process that holds the lock and the user of this process, for messages: `process 123 of the user of
     /// number 1000`. Returns `None` if the operating system does not report the holder.
     pub(crate) fn holder(&self) -> Option<String> {
-        let locks = fs::read_to_string("/proc/locks").ok()?;
+        // The list is read in pieces, so an entry can be missed while other programs lock and unlock.
+        const TRIES: usize = 8;
+        (0..TRIES).find_map(|_| self.holder_in(&fs::read_to_string("/proc/locks").ok()?))
+    }
+
+    /// Returns the process that holds this file in a list of all locks, and its user.
+    fn holder_in(&self, locks: &str) -> Option<String> {
         let [device, inode] = self.identity;
         let (major, minor) = (rustix::fs::major(device as _), rustix::fs::minor(device as _));
         let name = format!("{major:02x}:{minor:02x}:{inode}");
