@@ -620,7 +620,7 @@ fn report_with_header_of_shop() {
     for (bad, words) in [
         ("nam = \"a\"", "unknown field"),
         ("name = \"\"", "1 to 200"),
-        ("name = \"a\"\nlogo = \"shop.toml\"", "no PNG, JPEG or SVG"),
+        ("name = \"a\"\nlogo = \"shop.toml\"", "the logo shop.toml"),
         ("name = \"a\"\nlogo = \"nothing.png\"", "nothing.png"),
     ] {
         write(bad);
