@@ -1,6 +1,7 @@
 //! Unix socket in the run folder. A user who can write to it can connect.
 
 use std::io::{self, BufRead, BufReader, Write};
+use std::os::fd::AsRawFd;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -50,7 +51,7 @@ impl Endpoint {
         if path.exists() {
             regrind_formats::remove_socket(&path)?;
         }
-        let listener = UnixListener::bind(&path)?;
+        let listener = UnixListener::bind(&ShortPath::new(&path)?.path)?;
         let mark = identity(&path).ok().map(|identity| EndpointIdentity { path, identity });
         Ok(Self { listener, mark, is_for_user: false })
     }
@@ -166,6 +167,31 @@ fn socket_path(folder: &Path) -> PathBuf {
     folder.join(RunFile::ControlSocket.name())
 }
 
+/// Path of a socket, short enough for its address.
+struct ShortPath {
+    path: PathBuf,
+    /// Folder of the socket. `path` leads through its file descriptor, so it stays open.
+    _folder: Option<std::fs::File>,
+}
+
+impl ShortPath {
+    /// Returns the path `path`, or one through the open folder of the socket if `path` is too long for the address of a
+    /// socket. Returns an error if the folder cannot be opened.
+    fn new(path: &Path) -> io::Result<Self> {
+        /// Maximum length of a path in an address, in bytes, on every Unix.
+        const MAX_LENGTH: usize = 103;
+        let (Some(folder), Some(name)) = (path.parent(), path.file_name()) else {
+            return Ok(Self { path: path.to_owned(), _folder: None });
+        };
+        if path.as_os_str().len() <= MAX_LENGTH || !cfg!(target_os = "linux") {
+            return Ok(Self { path: path.to_owned(), _folder: None });
+        }
+        let folder = std::fs::File::open(folder)?;
+        let path = PathBuf::from(format!("/proc/self/fd/{}", folder.as_raw_fd())).join(name);
+        Ok(Self { path, _folder: Some(folder) })
+    }
+}
+
 /// Returns true if a process listens on the control socket of the run folder `folder`, even if this process does not
 /// answer at present.
 pub(crate) fn is_listening(folder: &Path) -> bool {
@@ -215,7 +241,7 @@ fn connect_stream(place: &Path) -> io::Result<std::os::unix::net::UnixStream> {
     use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
-    match connect(&socket, &SocketAddrUnix::new(place)?) {
+    match connect(&socket, &SocketAddrUnix::new(&ShortPath::new(place)?.path)?) {
         Err(rustix::io::Errno::AGAIN) => return Err(io::ErrorKind::TimedOut.into()),
         connected => connected?,
     }
@@ -240,5 +266,34 @@ fn exchange_on(mut stream: std::os::unix::net::UnixStream, line: &[u8], patience
 /// Connects to the cell of the run folder `folder` and returns the two halves of the connection, for reading and for
 /// writing. The connection can carry any number of lines. Returns an error if no cell listens.
 pub(crate) async fn open_connection(folder: &Path) -> io::Result<(CellReader, CellWriter)> {
-    UnixStream::connect(socket_path(folder)).await.map(UnixStream::into_split)
+    let place = ShortPath::new(&socket_path(folder))?;
+    UnixStream::connect(&place.path).await.map(UnixStream::into_split)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn socket_in_a_folder_with_a_long_path() {
+        let scratch = tempfile::tempdir().unwrap();
+        let short = scratch.path().join("run");
+        let long = scratch.path().join("a".repeat(120)).join("b".repeat(120));
+        for folder in [short, long] {
+            std::fs::create_dir_all(&folder).unwrap();
+            assert!(!is_listening(&folder));
+            let mut endpoint = Endpoint::open(&folder).unwrap();
+            let mark = endpoint.mark().unwrap();
+            assert!(mark.is_in_place() && socket_path(&folder).exists());
+            let (connected, accepted) = tokio::join!(open_connection(&folder), endpoint.accept());
+            assert!(connected.is_ok() && accepted.is_ok());
+            assert!(is_listening(&folder));
+            remove_endpoint(&folder);
+            assert!(!mark.is_in_place());
+            drop(endpoint);
+            let again = mark.open_again().unwrap();
+            assert!(is_listening(&folder));
+            drop(again);
+        }
+    }
 }
