@@ -18,6 +18,7 @@ use regrind::formats::run_files::{CycleFile, CycleFolder};
 use regrind::model::FIRST_BATCH;
 use regrind::recipe::{Recipe, SelectionMode};
 use regrind::report::{Language, ending_words, first_lines, in_air, verdict_in_words};
+use serde_json::json;
 use tokio::sync::mpsc;
 
 use super::blocks::{Blocks, sparkline};
@@ -83,7 +84,10 @@ impl Show {
     /// Shows each notice of the run that arrives in `notices`, as text or as a line of JSON. Returns when the run has
     /// ended and no further notice can arrive. Returns an error if standard output cannot be written.
     pub(super) async fn follow(mut self, mut notices: mpsc::UnboundedReceiver<Notice>) -> Result<(), Failure> {
-        if !self.json {
+        if self.json {
+            let first = json!({ "notice": "record", "folder": self.folder, "simulation": self.simulated });
+            super::print(&format!("{first}\n"))?;
+        } else {
             let marked = if self.simulated { "SIMULATION  " } else { "" };
             self.line(&format!("{marked}{}; tolerance {}", self.head, limits(&self.tolerance)))?;
             self.line(&format!("record in {}", self.folder))?;

@@ -133,7 +133,7 @@ fn deep_logo_is_drawn_or_refused() {
     assert_eq!(run(&["run", &recipe], home.path()).0, 0);
     fs::write(home.path().join("shop.toml"), "name = \"Optics\"\nlogo = \"logo.svg\"\n").unwrap();
     let [open, close] = ["<g opacity=\".9\">".repeat(120), "</g>".repeat(120)];
-    let mut code_of = |patterns: usize| {
+    let code_of = |patterns: usize| {
         let pattern = |k: usize| {
             let next = k + 1;
             format!(
