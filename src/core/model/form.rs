@@ -65,6 +65,8 @@ pub struct Form {
     pub is_underdetermined: bool,
 }
 
+/// Seed of the samples of all fields.
+const SEED: u64 = 1;
 /// Number of samples of one kind of field: the smooth fields for the lower bounds, the rough fields for the upper
 /// bounds.
 const BOUND_SAMPLES: usize = 250;
@@ -92,37 +94,40 @@ impl Form {
     pub fn estimate(registration: &Registration, inputs: &ModelInputs) -> Result<Self, ModelError> {
         let seen = FittedModel::fit(registration, inputs, true)?;
         let posterior = seen.posterior(inputs);
-        let chosen: Vec<usize> = thinned(seen.observed.places.len()).collect();
-        let some = seen.observed.subset(&chosen);
-        let at = |chosen: &[usize]| seen.ground_in.as_ref().map(|ground_in| ground_in.select_rows(chosen));
-        let of = |draws: PosteriorSamples, is_between: bool| {
-            let drawn = seen.evaluate_samples(draws, some.places.clone(), some.fixed_effects.clone(), is_between);
-            let drawn = SampledForms { chosen: chosen.clone(), ..drawn }.with_smooth_sigma(&seen.observed);
-            drawn.without_ground_in(at(&seen.indices_of_all(&chosen)).as_ref())
-        };
+        let at_points = AtPoints::new(&seen);
         let whole = |drawn: SampledForms, apart: &[usize], inputs: &ModelInputs| {
-            seen.with_unexplained_points(apart, drawn.with_unresolved_form(&seen.observed, &posterior, inputs), inputs)
-                .after_best_fit()
+            at_points.with_all_form(drawn, apart, (&posterior, inputs))
         };
-        let drawn = of(posterior.samples(HypothesisSet::All, SAMPLES, 1)?, true);
+        let drawn = at_points.smooth_forms(posterior.samples(HypothesisSet::All, SAMPLES, SEED)?, true);
         let slope = seen.slope(inputs, &posterior, &drawn);
         let drawn = whole(drawn, &seen.unexplained, inputs);
         let form = if seen.is_chance { &[][..] } else { &seen.confirmed };
-        let least = whole(
-            of(posterior.samples(HypothesisSet::Smooth, BOUND_SAMPLES, 2)?, false),
-            form,
-            &min_form_inputs(&posterior, inputs),
-        )
-        .figures_at_places();
+        let bounded = |of: HypothesisSet, seed: u64, apart: &[usize], inputs: &ModelInputs| {
+            let drawn = at_points.smooth_forms(posterior.samples(of, BOUND_SAMPLES, seed)?, false);
+            Ok::<_, ModelError>(whole(drawn, apart, inputs).figures_at_places())
+        };
+        let least = bounded(HypothesisSet::Smooth, 2, form, &min_form_inputs(&posterior, inputs))?;
         let most = match posterior.rough_probability() > MIN_PROBABILITY {
-            true => {
-                whole(of(posterior.samples(HypothesisSet::Rough, BOUND_SAMPLES, 3)?, false), &seen.unexplained, inputs)
-                    .figures_at_places()
-            }
+            true => bounded(HypothesisSet::Rough, 3, &seen.unexplained, inputs)?,
             false => Vec::new(),
         };
-        let ground_in = at(&drawn.chosen);
+        let ground_in = at_points.ground_in(&drawn.chosen);
         Ok(Self { slope, ..seen.form(inputs, &posterior, (&drawn, [&least, &most]), ground_in, true) })
+    }
+
+    /// Draws `count` samples of the form from its posterior, at the points of [`Form::points`]. The result has one row
+    /// for each point and one column for each sample, in mm. Each sample is a form after its own best fit. The same
+    /// `count` gives the same samples. 1000 samples are those of the figures.
+    ///
+    /// # Errors
+    /// Returns the errors of [`Form::estimate`].
+    pub fn sample(registration: &Registration, inputs: &ModelInputs, count: usize) -> Result<DMatrix<f64>, ModelError> {
+        let seen = FittedModel::fit(registration, inputs, true)?;
+        let posterior = seen.posterior(inputs);
+        let at_points = AtPoints::new(&seen);
+        let drawn = at_points.smooth_forms(posterior.samples(HypothesisSet::All, count, SEED)?, true);
+        let [forms, _] = at_points.with_all_form(drawn, &seen.unexplained, (&posterior, inputs)).forms;
+        Ok(forms)
     }
 
     /// Estimates the form of a part at the given `places`, and the figures over all these places. The places need not
@@ -162,7 +167,8 @@ impl Form {
         // If there are many more places than touches, the places are close enough to each other.
         let is_between = places.len() < 2 * seen.inliers.len();
         let at = places.iter().map(xy).collect();
-        let drawn = seen.evaluate_samples(posterior.samples(HypothesisSet::All, SAMPLES, 1)?, at, effects, is_between);
+        let drawn =
+            seen.evaluate_samples(posterior.samples(HypothesisSet::All, SAMPLES, SEED)?, at, effects, is_between);
         let drawn = SampledForms { untouched: (0..places.len()).collect(), ..drawn };
         let drawn = drawn.rough_where_touched(&seen.observed.places).with_smooth_sigma(&seen.observed);
         let ground_in = seen.ground_in.is_some().then(|| seen.machine_effects.columns(places.iter().copied()));
@@ -171,6 +177,46 @@ impl Form {
         let drawn =
             seen.with_unexplained_points(&seen.unexplained, drawn.with_narrow_form(inputs), inputs).after_best_fit();
         Ok(Self { slope, ..seen.form(inputs, &posterior, (&drawn, [&[], &[]]), ground_in, is_whole) })
+    }
+}
+
+/// Fitted model with the measured points at which its samples are evaluated.
+struct AtPoints<'a> {
+    model: &'a FittedModel,
+    /// Indices of these points among those that are not outliers.
+    chosen: Vec<usize>,
+    observed: Observations,
+}
+
+impl<'a> AtPoints<'a> {
+    fn new(model: &'a FittedModel) -> Self {
+        let chosen: Vec<usize> = thinned(model.observed.places.len()).collect();
+        Self { observed: model.observed.subset(&chosen), chosen, model }
+    }
+
+    /// Returns the columns of the machine effects that are ground into the part, at the points `chosen`.
+    fn ground_in(&self, chosen: &[usize]) -> Option<DMatrix<f64>> {
+        self.model.ground_in.as_ref().map(|ground_in| ground_in.select_rows(chosen))
+    }
+
+    /// Evaluates samples of the smooth form. `is_between` is that of [`FittedModel::evaluate_samples`].
+    fn smooth_forms(&self, draws: PosteriorSamples, is_between: bool) -> SampledForms {
+        let Observations { places, fixed_effects, .. } = &self.observed;
+        let drawn = self.model.evaluate_samples(draws, places.clone(), fixed_effects.clone(), is_between);
+        let drawn = SampledForms { chosen: self.chosen.clone(), ..drawn }.with_smooth_sigma(&self.model.observed);
+        drawn.without_ground_in(self.ground_in(&self.model.indices_of_all(&self.chosen)).as_ref())
+    }
+
+    /// Adds the form that is too narrow to be resolved and the points `apart` that no field explains, and subtracts
+    /// the best fit of each sample.
+    fn with_all_form(
+        &self,
+        drawn: SampledForms,
+        apart: &[usize],
+        (posterior, inputs): (&Posterior, &ModelInputs),
+    ) -> SampledForms {
+        let drawn = drawn.with_unresolved_form(&self.model.observed, posterior, inputs);
+        self.model.with_unexplained_points(apart, drawn, inputs).after_best_fit()
     }
 }
 

@@ -109,6 +109,20 @@ fn contains(interval: Interval, value: f64) -> bool {
 }
 
 #[test]
+fn thousand_samples_have_mean_and_sigma_of_points() {
+    let part = drawn_part(0, 5e-3);
+    let samples = Form::sample(&part.registration, &ModelInputs::default(), 1000).unwrap();
+    assert_eq!(samples.shape(), (part.model.points.len(), 1000));
+    for (row, point) in samples.row_iter().zip(&part.model.points) {
+        assert!((row.mean() - point.form.mean_mm).abs() < 1e-12);
+        let sigma_mm = (row.variance() * 1000.0 / 999.0).sqrt();
+        assert!((sigma_mm / point.form.sigma_mm - 1.0).abs() < 1e-9);
+    }
+    let few = Form::sample(&part.registration, &ModelInputs::default(), 3).unwrap();
+    assert_eq!(few.ncols(), 3);
+}
+
+#[test]
 fn form_and_frame_intervals_cover_truth() {
     let (mut rms, mut pv, mut areas) = (0, 0, [0; 9]);
     let (mut frame, mut repeated) = (0.0, 0.0);
