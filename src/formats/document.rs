@@ -218,7 +218,7 @@ pub fn save_registration(
 ) -> Result<(), FormatError> {
     let (rows, column) = rayon::join(
         || {
-            let rows: Vec<DeviationRow> = deviations.par_iter().map(row).collect();
+            let rows: Vec<DeviationRow> = deviations.par_iter().map(DeviationRow::from).collect();
             write_deviations(folder.join(CycleFile::Deviations.name()), &rows)
         },
         || {
@@ -230,11 +230,13 @@ pub fn save_registration(
     write_json_atomic(folder.join(CycleFile::Registration.name()), document)
 }
 
-fn row(deviation: &Deviation) -> DeviationRow {
-    DeviationRow {
-        point_mm: deviation.point.into(),
-        normal: deviation.normal.into(),
-        deviation_mm: deviation.deviation_mm,
-        used: deviation.status == PointStatus::Inlier,
+impl From<&Deviation> for DeviationRow {
+    fn from(deviation: &Deviation) -> Self {
+        Self {
+            point_mm: deviation.point.into(),
+            normal: deviation.normal.into(),
+            deviation_mm: deviation.deviation_mm,
+            used: deviation.status == PointStatus::Inlier,
+        }
     }
 }
