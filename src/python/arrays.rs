@@ -1,11 +1,80 @@
 //! Arrays of points between numpy and the core.
 
-use numpy::ndarray::{Array2, ArrayView1};
-use numpy::{AllowTypeChange, PyArray2, PyArrayLike2, ToPyArray};
+use std::convert::Infallible;
+
+use numpy::ndarray::{Array1, Array2, Dimension, Ix1, Ix2};
+use numpy::{AllowTypeChange, Element, IntoPyArray, PyArray, PyArrayLike2};
+use pyo3::inspect::PyStaticExpr;
 use pyo3::prelude::*;
-use regrind_core::geometry::{Point, Vector};
+use regrind_core::geometry::{Grid, Point, Vector};
 
 use super::errors::DataError;
+
+/// Argument of which numpy can make an array.
+pub(crate) struct ArrayLike<'py>(pub(crate) Bound<'py, PyAny>);
+
+impl<'py> FromPyObject<'_, 'py> for ArrayLike<'py> {
+    type Error = Infallible;
+
+    const INPUT_TYPE: PyStaticExpr = name(&NUMPY_TYPING, "ArrayLike");
+
+    fn extract(given: Borrowed<'_, 'py, PyAny>) -> Result<Self, Infallible> {
+        Ok(Self(given.to_owned()))
+    }
+}
+
+/// Array for Python, with its type for the stubs.
+pub(crate) struct Output<'py, T, D>(Bound<'py, PyArray<T, D>>);
+pub(crate) type Output1<'py, T = f64> = Output<'py, T, Ix1>;
+pub(crate) type Output2<'py, T = f64> = Output<'py, T, Ix2>;
+
+/// Element of an array, with its name in numpy.
+pub(crate) trait NamedElement: Element {
+    const NAME: PyStaticExpr;
+}
+
+impl NamedElement for f64 {
+    const NAME: PyStaticExpr = name(&NUMPY, "float64");
+}
+
+impl NamedElement for bool {
+    const NAME: PyStaticExpr = name(&NUMPY, "bool_");
+}
+
+impl NamedElement for u32 {
+    const NAME: PyStaticExpr = name(&NUMPY, "uint32");
+}
+
+impl<'py, T: NamedElement, D: Dimension> IntoPyObject<'py> for Output<'py, T, D> {
+    type Target = PyArray<T, D>;
+    type Output = Bound<'py, Self::Target>;
+    type Error = Infallible;
+
+    const OUTPUT_TYPE: PyStaticExpr =
+        PyStaticExpr::Subscript { value: &name(&NUMPY_TYPING, "NDArray"), slice: &T::NAME };
+
+    fn into_pyobject(self, _: Python<'py>) -> Result<Self::Output, Infallible> {
+        Ok(self.0)
+    }
+}
+
+const NUMPY: PyStaticExpr = PyStaticExpr::Name { id: "numpy" };
+const NUMPY_TYPING: PyStaticExpr = PyStaticExpr::Name { id: "numpy.typing" };
+
+const fn name(module: &'static PyStaticExpr, attr: &'static str) -> PyStaticExpr {
+    PyStaticExpr::Attribute { value: module, attr }
+}
+
+/// Returns values as an array with one axis.
+pub(crate) fn output<T: NamedElement>(py: Python<'_>, values: Vec<T>) -> Output1<'_, T> {
+    Output(Array1::from_vec(values).into_pyarray(py))
+}
+
+/// Returns values, row after row, as an array with two axes. There are as many values as the array has.
+pub(crate) fn output2<T: NamedElement>(py: Python<'_>, shape: (usize, usize), values: Vec<T>) -> Output2<'_, T> {
+    // Another number of values would be a mistake of the caller.
+    Output(Array2::from_shape_vec(shape, values).expect("as many values as nodes").into_pyarray(py))
+}
 
 /// Reads an argument as an array with two axes: any layout, and any type of real numbers.
 ///
@@ -58,27 +127,38 @@ pub(crate) fn points(given: &Bound<PyAny>, name: &str) -> PyResult<Vec<Point>> {
             rows.ncols()
         )));
     }
-    let point = |(k, row): (usize, ArrayView1<f64>)| {
-        let [x, y, z] = [row[0], row[1], row[2]];
-        if [x, y, z].iter().all(|c| c.is_finite()) {
-            Ok(Point::new(x, y, z))
-        } else {
+    let point = |[x, y, z]: [f64; 3]| Point::new(x, y, z);
+    let points: Vec<Point> = match rows.as_slice() {
+        Some(flat) => flat.as_chunks().0.iter().copied().map(point).collect(),
+        None => rows.outer_iter().map(|row| point([row[0], row[1], row[2]])).collect(),
+    };
+    match points.iter().position(|point| !point.coords.iter().all(|c| c.is_finite())) {
+        None => Ok(points),
+        Some(k) => {
+            let [x, y, z] = points[k].coords.into();
             Err(DataError::new_err(format!("{name}: row {k} is ({x}, {y}, {z}); remove rows that are not finite")))
         }
-    };
-    rows.outer_iter().enumerate().map(point).collect()
+    }
 }
 
 /// Returns vectors as an array with one row for each.
-pub(crate) fn vectors<'py>(py: Python<'py>, rows: impl ExactSizeIterator<Item = Vector>) -> Bound<'py, PyArray2<f64>> {
+pub(crate) fn vectors(py: Python<'_>, rows: impl ExactSizeIterator<Item = Vector>) -> Output2<'_> {
     let count = rows.len();
-    let flat: Vec<f64> = rows.flat_map(|row| [row.x, row.y, row.z]).collect();
-    let array = Array2::from_shape_vec((count, 3), flat).unwrap_or_default();
-    array.to_pyarray(py)
+    output2(py, (count, 3), rows.flat_map(|row| [row.x, row.y, row.z]).collect())
 }
 
 /// Returns rows of a fixed length as an array.
-pub(crate) fn square<'py, const N: usize>(py: Python<'py>, rows: [[f64; N]; N]) -> Bound<'py, PyArray2<f64>> {
-    let array = Array2::from_shape_fn((N, N), |(row, column)| rows[row][column]);
-    array.to_pyarray(py)
+pub(crate) fn square<const N: usize>(py: Python<'_>, rows: [[f64; N]; N]) -> Output2<'_> {
+    output2(py, (N, N), rows.concat())
+}
+
+/// Returns the places of the nodes of a grid along x (0) or y (1), in mm.
+pub(crate) fn axis_places_mm(grid: &Grid, axis: usize) -> Vec<f64> {
+    let count = [grid.columns, grid.rows][axis];
+    (0..count).map(|node| grid.first_mm[axis] + grid.spacing_mm[axis] * node as f64).collect()
+}
+
+/// Returns values at the nodes of a grid as an array with one row for each y.
+pub(crate) fn on_grid<'py>(py: Python<'py>, grid: &Grid, values: Vec<f64>) -> Output2<'py> {
+    output2(py, (grid.rows, grid.columns), values)
 }

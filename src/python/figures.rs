@@ -1,13 +1,11 @@
 //! Figures and maps of deviations: ISO 10110-5, Zernike polynomials, the filtered map.
 
-use numpy::ndarray::Array2;
-use numpy::{PyArray1, PyArray2, ToPyArray};
 use pyo3::prelude::*;
 use regrind_core::compensation::{ErrorMap, FilterOrder, MapOptions, Smoothing, filter_grid};
 use regrind_core::form::{FormOptions, Iso10110, PolynomialBasis, PolynomialFit, compute_figures, fit_polynomials};
 use regrind_core::geometry::{Aperture, DeviationSample, Grid, GridMap};
 
-use super::arrays::{column, rows};
+use super::arrays::{ArrayLike, Output1, Output2, axis_places_mm, column, on_grid, output, rows};
 use super::errors::{DataError, data};
 
 /// Power, irregularity and symmetric part by ISO 10110-5, in nanometres.
@@ -63,14 +61,14 @@ pub(crate) struct PyPolynomialFit {
 impl PyPolynomialFit {
     /// Coefficients in mm, (K,); each polynomial has the mean square 1 over the full disc.
     #[getter]
-    fn coefficients<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        self.fit.coefficients_mm.to_pyarray(py)
+    fn coefficients<'py>(&self, py: Python<'py>) -> Output1<'py> {
+        output(py, self.fit.coefficients_mm.clone())
     }
 
     /// Contribution of each polynomial to the root mean square in mm, (K,), after it was made orthogonal at the points.
     #[getter]
-    fn orthogonal<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        self.fit.orthogonal_mm.to_pyarray(py)
+    fn orthogonal<'py>(&self, py: Python<'py>) -> Output1<'py> {
+        output(py, self.fit.orthogonal_mm.clone())
     }
 
     /// Name of each polynomial, such as "Z5 (2, 2)".
@@ -94,26 +92,28 @@ impl PyPolynomialFit {
 /// Map of the error on a grid, filtered by a Gaussian filter of ISO 16610-61.
 #[pyclass(name = "ErrorMap", module = "regrind", frozen)]
 pub(crate) struct PyErrorMap {
-    map: ErrorMap,
+    pub(crate) map: ErrorMap,
+    /// Options of the map.
+    pub(crate) options: MapOptions,
 }
 
 #[pymethods]
 impl PyErrorMap {
     /// Places of the columns along x in mm, (M,).
     #[getter]
-    fn x<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        self.axis(0).to_pyarray(py)
+    fn x<'py>(&self, py: Python<'py>) -> Output1<'py> {
+        output(py, self.axis(0))
     }
 
     /// Places of the rows along y in mm, (N,).
     #[getter]
-    fn y<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        self.axis(1).to_pyarray(py)
+    fn y<'py>(&self, py: Python<'py>) -> Output1<'py> {
+        output(py, self.axis(1))
     }
 
     /// Error at each node in mm, (N, M); NaN where too few points are near.
     #[getter]
-    fn values<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+    fn values<'py>(&self, py: Python<'py>) -> Output2<'py> {
         let nodes = &self.map.nodes;
         let known =
             nodes.values_mm.iter().zip(&nodes.valid).map(|(value, valid)| if *valid { *value } else { f64::NAN });
@@ -122,7 +122,7 @@ impl PyErrorMap {
 
     /// Standard uncertainty of the error at each node from the noise of the points in mm, (N, M).
     #[getter]
-    fn uncertainty<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+    fn uncertainty<'py>(&self, py: Python<'py>) -> Output2<'py> {
         self.array(py, self.map.sigma_mm.clone())
     }
 
@@ -152,14 +152,11 @@ impl PyErrorMap {
 
 impl PyErrorMap {
     fn axis(&self, k: usize) -> Vec<f64> {
-        let grid = self.map.nodes.grid;
-        let count = [grid.columns, grid.rows][k];
-        (0..count).map(|node| grid.first_mm[k] + grid.spacing_mm[k] * node as f64).collect()
+        axis_places_mm(&self.map.nodes.grid, k)
     }
 
-    fn array<'py>(&self, py: Python<'py>, values: Vec<f64>) -> Bound<'py, PyArray2<f64>> {
-        let grid = self.map.nodes.grid;
-        Array2::from_shape_vec((grid.rows, grid.columns), values).unwrap_or_default().to_pyarray(py)
+    fn array<'py>(&self, py: Python<'py>, values: Vec<f64>) -> Output2<'py> {
+        on_grid(py, &self.map.nodes.grid, values)
     }
 }
 
@@ -170,17 +167,22 @@ impl PyErrorMap {
 /// and only appears in the notation.
 ///
 /// Raises DataError if the points do not determine the figures.
+///
+/// >>> x, y = np.meshgrid(np.linspace(-10, 10, 41), np.linspace(-10, 10, 41))
+/// >>> places = np.column_stack([x.ravel(), y.ravel()])
+/// >>> round(regrind.iso10110(places, 1e-5 * (x**2 + y**2).ravel()).power_nm)
+/// 2000
 #[pyfunction]
 #[pyo3(signature = (places, deviations, *, radius = None, centre = [0.0, 0.0], wavelength = 632.8e-6))]
 pub(crate) fn iso10110(
     py: Python,
-    places: &Bound<PyAny>,
-    deviations: &Bound<PyAny>,
+    places: ArrayLike,
+    deviations: ArrayLike,
     radius: Option<f64>,
     centre: [f64; 2],
     wavelength: f64,
 ) -> PyResult<PyIso10110> {
-    let samples = samples(places, deviations)?;
+    let samples = samples(&places.0, &deviations.0)?;
     let aperture = radius.map(|radius_mm| disc(radius_mm, centre)).transpose()?;
     let options = FormOptions { aperture, wavelength_nm: 1e6 * wavelength, ..FormOptions::default() };
     let figures = py.detach(|| compute_figures(&samples, &options)).map_err(data)?;
@@ -193,17 +195,23 @@ pub(crate) fn iso10110(
 /// mm. `terms` is the number of polynomials, 1 to 37.
 ///
 /// Raises DataError if the points do not determine the polynomials.
+///
+/// >>> x, y = np.meshgrid(np.linspace(-10, 10, 41), np.linspace(-10, 10, 41))
+/// >>> places = np.column_stack([x.ravel(), y.ravel()])
+/// >>> fit = regrind.zernike_fit(places, 1e-5 * x.ravel(), radius=10, terms=4)
+/// >>> fit.terms[1], (1e6 * fit.coefficients[1]).round(3).item()
+/// ('Z2 (1, 1)', 50.0)
 #[pyfunction]
 #[pyo3(signature = (places, deviations, *, radius, centre = [0.0, 0.0], terms = 36))]
 pub(crate) fn zernike_fit(
     py: Python,
-    places: &Bound<PyAny>,
-    deviations: &Bound<PyAny>,
+    places: ArrayLike,
+    deviations: ArrayLike,
     radius: f64,
     centre: [f64; 2],
     terms: usize,
 ) -> PyResult<PyPolynomialFit> {
-    let samples = samples(places, deviations)?;
+    let samples = samples(&places.0, &deviations.0)?;
     let basis = PolynomialBasis::zernike(&disc(radius, centre)?);
     let fit = py.detach(|| fit_polynomials(&basis, terms, &samples)).map_err(data)?;
     Ok(PyPolynomialFit { fit })
@@ -216,21 +224,27 @@ pub(crate) fn zernike_fit(
 /// selects the robust filter of ISO 16610-71.
 ///
 /// Raises DataError if the points are too few or too far apart for the cut-off.
+///
+/// >>> x, y = np.meshgrid(np.linspace(-10, 10, 41), np.linspace(-10, 10, 41))
+/// >>> places = np.column_stack([x.ravel(), y.ravel()])
+/// >>> map = regrind.error_map(places, 1e-4 * x.ravel(), cutoff=4, spacing=2)
+/// >>> (1e3 * map.values[5]).round(3).tolist()
+/// [-1.0, -0.8, -0.6, -0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
 #[pyfunction]
 #[pyo3(signature = (places, deviations, *, cutoff, spacing = None, robust = false))]
 pub(crate) fn error_map(
     py: Python,
-    places: &Bound<PyAny>,
-    deviations: &Bound<PyAny>,
+    places: ArrayLike,
+    deviations: ArrayLike,
     cutoff: f64,
     spacing: Option<f64>,
     robust: bool,
 ) -> PyResult<PyErrorMap> {
-    let samples = samples(places, deviations)?;
+    let samples = samples(&places.0, &deviations.0)?;
     let smoothing = if robust { Smoothing::RobustGaussian } else { Smoothing::Gaussian };
     let options = MapOptions { smoothing, ..MapOptions::new(cutoff, spacing.unwrap_or(0.2 * cutoff)) };
     let map = py.detach(|| regrind_core::compensation::error_map(&samples, &options)).map_err(data)?;
-    Ok(PyErrorMap { map })
+    Ok(PyErrorMap { map, options })
 }
 
 /// Filters a map of heights by the areal Gaussian filter of ISO 16610-61.
@@ -241,17 +255,21 @@ pub(crate) fn error_map(
 /// values around them are NaN.
 ///
 /// Raises DataError for arguments that cannot be used.
+///
+/// >>> heights = np.tile([1.0, -1.0], (20, 10))
+/// >>> round(abs(regrind.gaussian(heights, spacing=(1, 1), cutoff=8)[:, 6:14]).max().item(), 2)
+/// 0.0
 #[pyfunction]
-#[pyo3(signature = (values, *, spacing, cutoff, order = 1, robust = false))]
+#[pyo3(signature = (values, *, spacing, cutoff, order: "Literal[0, 1, 2]" = 1, robust = false))]
 pub(crate) fn gaussian<'py>(
     py: Python<'py>,
-    values: &Bound<'py, PyAny>,
+    values: ArrayLike<'py>,
     spacing: [f64; 2],
     cutoff: f64,
     order: u8,
     robust: bool,
-) -> PyResult<Bound<'py, PyArray2<f64>>> {
-    let heights = rows(values, "values")?;
+) -> PyResult<Output2<'py>> {
+    let heights = rows(&values.0, "values")?;
     let heights = heights.as_array();
     let order = match order {
         0 => FilterOrder::Constant,
@@ -269,8 +287,7 @@ pub(crate) fn gaussian<'py>(
     let filtered = py.detach(|| filter_grid(&map, cutoff, order, robust)).map_err(data)?.nodes;
     let known =
         filtered.values_mm.iter().zip(&filtered.valid).map(|(value, valid)| if *valid { *value } else { f64::NAN });
-    let known = Array2::from_shape_vec((grid.rows, grid.columns), known.collect()).unwrap_or_default();
-    Ok(known.to_pyarray(py))
+    Ok(on_grid(py, &grid, known.collect()))
 }
 
 fn disc(radius_mm: f64, centre_mm: [f64; 2]) -> PyResult<Aperture> {

@@ -1,12 +1,11 @@
 //! Model of the form: the error of the part without the noise of the probe.
 
-use numpy::{PyArray1, PyArray2, ToPyArray};
 use pyo3::prelude::*;
 use regrind_core::model::{Form, ModelInputs};
 use regrind_figures::Interval;
 
-use super::arrays::square;
-use super::errors::ModelError;
+use super::arrays::{Output1, Output2, output, output2, square};
+use super::errors::{DataError, ModelError};
 use super::registration::PyRegistration;
 
 /// Median and 95 % interval of a figure, in mm.
@@ -39,15 +38,46 @@ impl From<&Interval> for PyInterval {
 #[pyclass(name = "Form", module = "regrind", frozen)]
 pub(crate) struct PyForm {
     form: Form,
+    /// Registration and inputs from which samples are drawn.
+    registration: Py<PyRegistration>,
+    inputs: ModelInputs,
 }
+
+/// Maximum number of values of all samples of one call: 800 MB.
+const MAX_SAMPLED_VALUES: usize = 100_000_000;
 
 /// Separates the form from the noise of the probe by a Gaussian process, and states PV and RMS with 95 % intervals.
 ///
+/// `radius_uncertainty` is the standard uncertainty of the radius of the probe in mm, and `length_uncertainty` the
+/// relative standard uncertainty of all lengths. No point can show them, so both are 0 unless they are stated.
+///
 /// Raises ModelError with the reason if the deviations give no model.
+///
+/// >>> x = np.linspace(-20, 20, 81)
+/// >>> saddle = lambda x, y: 4e-3 * x**2 - 3e-3 * y**2 + 1e-4 * x**3 + 8e-5 * x * y**2
+/// >>> nominal = regrind.Nominal.from_function(saddle, x, x)
+/// >>> noise = np.random.default_rng(1).normal(0, 2e-4, nominal.points[::7].shape)
+/// >>> found = regrind.register(nominal, nominal.offset(1.5)[::7] + noise, probe_radius=1.5)
+/// >>> form = regrind.model(found)
+/// >>> print(f"noise of the probe: {1e3 * form.noise_sigma:.1f} um")
+/// noise of the probe: 0.2 um
 #[pyfunction]
-pub(crate) fn model(py: Python, registration: &PyRegistration) -> PyResult<PyForm> {
-    let form = py.detach(|| Form::estimate(&registration.found, &ModelInputs::default()));
-    form.map(|form| PyForm { form }).map_err(|error| ModelError::new_err(error.to_string()))
+#[pyo3(signature = (registration, *, radius_uncertainty = 0.0, length_uncertainty = 0.0))]
+pub(crate) fn model(
+    py: Python,
+    registration: Py<PyRegistration>,
+    radius_uncertainty: f64,
+    length_uncertainty: f64,
+) -> PyResult<PyForm> {
+    let inputs =
+        ModelInputs { radius_sigma_mm: radius_uncertainty, scale_sigma: length_uncertainty, ..ModelInputs::default() };
+    let found = &registration.get().found;
+    let form = py.detach(|| Form::estimate(found, &inputs)).map_err(refused)?;
+    Ok(PyForm { form, registration, inputs })
+}
+
+fn refused(error: regrind_core::model::ModelError) -> PyErr {
+    ModelError::new_err(error.to_string())
 }
 
 #[pymethods]
@@ -84,21 +114,36 @@ impl PyForm {
 
     /// Form at each used point in mm, (M,). A scan of more than 6,000 points is reduced to 6,000.
     #[getter]
-    fn values<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        self.form.points.iter().map(|of| of.form.mean_mm).collect::<Vec<_>>().to_pyarray(py)
+    fn values<'py>(&self, py: Python<'py>) -> Output1<'py> {
+        output(py, self.form.points.iter().map(|of| of.form.mean_mm).collect())
     }
 
     /// Standard uncertainty of the form at each of these points in mm, (M,).
     #[getter]
-    fn uncertainty<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        self.form.points.iter().map(|of| of.form.sigma_mm).collect::<Vec<_>>().to_pyarray(py)
+    fn uncertainty<'py>(&self, py: Python<'py>) -> Output1<'py> {
+        output(py, self.form.points.iter().map(|of| of.form.sigma_mm).collect())
     }
 
     /// Covariance of the pose of the nominal frame including the uncertainty of the form, (6, 6), in mm and rad.
     #[getter]
-    fn frame_covariance<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+    fn frame_covariance<'py>(&self, py: Python<'py>) -> Output2<'py> {
         let covariance = &self.form.frame_covariance;
         square::<6>(py, std::array::from_fn(|row| std::array::from_fn(|column| covariance[(row, column)])))
+    }
+
+    /// Samples of the form from its posterior at the same points in mm, (`count`, M). Each row is a form that the
+    /// points allow. The same `count` gives the same samples; 1000 are those from which the figures come.
+    ///
+    /// Raises DataError for 0 samples, and for more than 1e8 values.
+    fn sample<'py>(&self, py: Python<'py>, count: usize) -> PyResult<Output2<'py>> {
+        let most = MAX_SAMPLED_VALUES / self.form.points.len().max(1);
+        if !(1..=most).contains(&count) {
+            return Err(DataError::new_err(format!("count is {count}; it must be 1 to {most} for so many points")));
+        }
+        let found = &self.registration.get().found;
+        let samples = py.detach(|| Form::sample(found, &self.inputs, count)).map_err(refused)?;
+        // Samples are columns, one after the other: the rows of the array.
+        Ok(output2(py, (samples.ncols(), samples.nrows()), samples.as_slice().to_vec()))
     }
 
     fn __repr__(&self) -> String {

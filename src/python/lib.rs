@@ -11,29 +11,32 @@
 mod arrays;
 mod errors;
 mod figures;
+mod files;
 mod form;
 mod nominal;
+mod path;
 mod registration;
 
 use pyo3::prelude::*;
 
-/// Adds the classes, the functions and the exceptions to the module.
+/// Exact registration of measured probe centres to the offset of a nominal surface, with uncertainty.
 #[pymodule]
-fn _regrind(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add("__version__", env!("CARGO_PKG_VERSION"))?;
-    errors::add_to(module)?;
-    module.add_class::<nominal::PyNominal>()?;
-    module.add_class::<registration::PyRegistration>()?;
-    module.add_class::<form::PyForm>()?;
-    module.add_class::<form::PyInterval>()?;
-    module.add_class::<figures::PyErrorMap>()?;
-    module.add_class::<figures::PyIso10110>()?;
-    module.add_class::<figures::PyPolynomialFit>()?;
-    module.add_function(wrap_pyfunction!(figures::error_map, module)?)?;
-    module.add_function(wrap_pyfunction!(figures::gaussian, module)?)?;
-    module.add_function(wrap_pyfunction!(figures::iso10110, module)?)?;
-    module.add_function(wrap_pyfunction!(figures::zernike_fit, module)?)?;
-    module.add_function(wrap_pyfunction!(registration::register, module)?)?;
-    module.add_function(wrap_pyfunction!(form::model, module)?)?;
-    module.add_function(wrap_pyfunction!(nominal::read_points, module)?)
+mod _regrind {
+    #[pymodule_export]
+    use super::figures::{PyErrorMap, PyIso10110, PyPolynomialFit, error_map, gaussian, iso10110, zernike_fit};
+    #[pymodule_export]
+    use super::files::{read, write};
+    #[pymodule_export]
+    use super::form::{PyForm, PyInterval, model};
+    #[pymodule_export]
+    use super::nominal::PyNominal;
+    #[pymodule_export]
+    use super::path::{PyCorrection, PyToolPath, compensate, toolpath};
+    #[pymodule_export]
+    use super::registration::{PyRegistration, register};
+
+    /// Version of the package.
+    #[pymodule_export]
+    #[expect(non_upper_case_globals, reason = "the name that Python packages use")]
+    const __version__: &str = env!("CARGO_PKG_VERSION");
 }

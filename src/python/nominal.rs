@@ -1,19 +1,39 @@
 //! Nominal surfaces.
 
 use std::path::PathBuf;
+use std::sync::OnceLock;
 
-use numpy::PyArray2;
 use pyo3::prelude::*;
 use regrind_core::surface::{DefinedSurface, Nominal, NominalKind, PlaneProjection};
-use regrind_formats::{NominalFile, Table, read_measured_with_notes, read_nominal_as};
+use regrind_formats::{NominalFile, Table, read_nominal_with_identity};
+use sha2::{Digest, Sha256};
 
-use super::arrays::{points, rows, vectors};
+use super::arrays::{ArrayLike, Output2, points, rows, vectors};
 use super::errors::{DataError, data};
 
 /// Nominal surface: the ideal shape of a part.
 #[pyclass(name = "Nominal", module = "regrind", frozen)]
 pub(crate) struct PyNominal {
     pub(crate) nominal: Nominal,
+    /// SHA-256 of the file or of the text; empty for points until it is asked for.
+    identity: OnceLock<[u8; 32]>,
+}
+
+impl PyNominal {
+    fn new(nominal: Nominal, identity: Option<[u8; 32]>) -> Self {
+        Self { nominal, identity: identity.map_or_else(OnceLock::new, OnceLock::from) }
+    }
+
+    /// Returns the SHA-256 of the file, of the text or of the points: maps and programs name the part by it.
+    pub(crate) fn identity(&self) -> [u8; 32] {
+        *self.identity.get_or_init(|| {
+            let mut hash = Sha256::new();
+            for point in self.nominal.points() {
+                point.coords.iter().for_each(|c| hash.update(c.to_le_bytes()));
+            }
+            hash.finalize().into()
+        })
+    }
 }
 
 #[pymethods]
@@ -24,13 +44,17 @@ impl PyNominal {
     /// points: "auto", "xy", "best-fit" or "spherical".
     ///
     /// Raises DataError if no surface can be built from the points.
+    ///
+    /// >>> x, y = np.meshgrid(np.arange(5.0), np.arange(4.0))
+    /// >>> regrind.Nominal.from_points(np.column_stack([x.ravel(), y.ravel(), 0.01 * x.ravel() ** 2]))
+    /// Nominal(20 points, grid of 5 x 4)
     #[staticmethod]
-    #[pyo3(signature = (points, projection = "auto"))]
-    fn from_points(py: Python, points: &Bound<PyAny>, projection: &str) -> PyResult<Self> {
-        let points = self::points(points, "points")?;
+    #[pyo3(signature = (points, projection: "Literal['auto', 'xy', 'best-fit', 'spherical']" = "auto"))]
+    fn from_points(py: Python, points: ArrayLike, projection: &str) -> PyResult<Self> {
+        let points = self::points(&points.0, "points")?;
         let projection = plane(projection)?;
         let nominal = py.detach(|| Nominal::from_points(points, projection)).map_err(data)?;
-        Ok(Self { nominal })
+        Ok(Self::new(nominal, None))
     }
 
     /// Surface of a function z = function(x, y) on a grid.
@@ -39,15 +63,17 @@ impl PyNominal {
     /// same shape.
     ///
     /// Raises DataError if the heights have another shape, or if no surface can be built from them.
+    ///
+    /// >>> x = np.linspace(-20, 20, 81)
+    /// >>> saddle = lambda x, y: 4e-3 * x**2 - 3e-3 * y**2 + 1e-4 * x**3 + 8e-5 * x * y**2
+    /// >>> nominal = regrind.Nominal.from_function(saddle, x, x)
+    /// >>> nominal
+    /// Nominal(6561 points, grid of 81 x 81)
     #[staticmethod]
-    fn from_function(
-        py: Python,
-        function: Bound<'_, PyAny>,
-        x: Bound<'_, PyAny>,
-        y: Bound<'_, PyAny>,
-    ) -> PyResult<Self> {
+    #[pyo3(signature = (function: "Callable[[NDArray[float64], NDArray[float64]], ArrayLike]", x, y))]
+    fn from_function(py: Python, function: Bound<'_, PyAny>, x: ArrayLike, y: ArrayLike) -> PyResult<Self> {
         let numpy = py.import("numpy")?;
-        let grid = numpy.call_method1("meshgrid", (x, y))?;
+        let grid = numpy.call_method1("meshgrid", (x.0, y.0))?;
         let [x, y] = [grid.get_item(0)?, grid.get_item(1)?];
         let z = numpy.call_method1("asarray", (function.call1((&x, &y))?,))?;
         let [wanted, found] = [x.getattr("shape")?, z.getattr("shape")?];
@@ -58,7 +84,7 @@ impl PyNominal {
         }
         let columns = [x, y, z].map(|column| column.call_method0("ravel"));
         let [x, y, z] = columns;
-        Self::from_points(py, &numpy.call_method1("column_stack", ((x?, y?, z?),))?, "xy")
+        Self::from_points(py, ArrayLike(numpy.call_method1("column_stack", ((x?, y?, z?),))?), "xy")
     }
 
     /// Surface of a triangle mesh, oriented by its corners.
@@ -66,10 +92,14 @@ impl PyNominal {
     /// Shapes: `points` is (N, 3), in mm; `triangles` is (M, 3), with indices of points.
     ///
     /// Raises DataError if the mesh is closed or has a mistake.
+    ///
+    /// >>> corners = [[0, 0, 0], [10, 0, 0], [10, 10, 1], [0, 10, 1]]
+    /// >>> regrind.Nominal.from_mesh(corners, [[0, 1, 2], [0, 2, 3]])
+    /// Nominal(4 points, mesh)
     #[staticmethod]
-    fn from_mesh(py: Python, points: &Bound<PyAny>, triangles: &Bound<PyAny>) -> PyResult<Self> {
-        let points = self::points(points, "points")?;
-        let rows = rows(triangles, "triangles")?;
+    fn from_mesh(py: Python, points: ArrayLike, triangles: ArrayLike) -> PyResult<Self> {
+        let points = self::points(&points.0, "points")?;
+        let rows = rows(&triangles.0, "triangles")?;
         let rows = rows.as_array();
         if rows.ncols() != 3 {
             return Err(DataError::new_err(format!("triangles has the shape {:?}; it must be (M, 3)", rows.shape())));
@@ -91,45 +121,63 @@ impl PyNominal {
                 Ok(nominal)
             })
             .map_err(|error: regrind_core::surface::SurfaceError| data(error))?;
-        Ok(Self { nominal })
+        Ok(Self::new(nominal, None))
     }
 
     /// Surface of the definition in a TOML text, such as an asphere or a free form with its aperture.
     ///
     /// Raises DataError with the place of every mistake.
+    ///
+    /// >>> regrind.Nominal.from_toml("""
+    /// ... [surface]
+    /// ... kind = "asphere"
+    /// ... radius_mm = 180.0
+    /// ... conic = -1.2
+    /// ... coefficients = { A4 = 2.0e-8 }
+    /// ... [aperture]
+    /// ... kind = "circle"
+    /// ... radius_mm = 10.0
+    /// ... [sampling]
+    /// ... spacing_mm = 0.5
+    /// ... """)
+    /// Nominal(1457 points, grid of 43 x 43)
     #[staticmethod]
     fn from_toml(py: Python, text: &str) -> PyResult<Self> {
-        py.detach(|| defined(text)).map(|nominal| Self { nominal })
+        let identity = Sha256::digest(text).into();
+        py.detach(|| defined(text)).map(|nominal| Self::new(nominal, Some(identity)))
     }
 
     /// Surface in a file: points as text or PLY, a mesh as STL or PLY, or a TOML definition.
     ///
     /// Raises DataError with the path, the place and the reason.
     #[staticmethod]
-    #[pyo3(signature = (path, projection = "auto"))]
+    #[pyo3(signature = (path, projection: "Literal['auto', 'xy', 'best-fit', 'spherical']" = "auto"))]
     fn from_file(py: Python, path: PathBuf, projection: &str) -> PyResult<Self> {
         let projection = plane(projection)?;
-        let nominal = py.detach(|| match read_nominal_as(&path, &Table::default()).map_err(data)? {
-            NominalFile::Points(points) => Nominal::from_points(points, projection).map_err(data),
-            NominalFile::Mesh { points, triangles } => {
-                let nominal = Nominal::from_mesh(points, triangles).map_err(data)?;
-                nominal.check_is_open().map_err(data)?;
-                Ok(nominal)
-            }
-            NominalFile::Definition(text) => defined(&text),
-        })?;
-        Ok(Self { nominal })
+        py.detach(|| {
+            let (read, identity) = read_nominal_with_identity(&path, &Table::default()).map_err(data)?;
+            let nominal = match read {
+                NominalFile::Points(points) => Nominal::from_points(points, projection).map_err(data)?,
+                NominalFile::Mesh { points, triangles } => {
+                    let nominal = Nominal::from_mesh(points, triangles).map_err(data)?;
+                    nominal.check_is_open().map_err(data)?;
+                    nominal
+                }
+                NominalFile::Definition(text) => defined(&text)?,
+            };
+            Ok(Self::new(nominal, Some(identity)))
+        })
     }
 
     /// Points of the surface, (N, 3), in mm.
     #[getter]
-    fn points<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+    fn points<'py>(&self, py: Python<'py>) -> Output2<'py> {
         let points: Vec<_> = self.nominal.points().map(|point| point.coords).collect();
         vectors(py, points.into_iter())
     }
 
     /// Points of the offset surface, (N, 3), in mm: the points moved along their normals by `distance` in mm; eq. (3).
-    fn offset<'py>(&self, py: Python<'py>, distance: f64) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    fn offset<'py>(&self, py: Python<'py>, distance: f64) -> PyResult<Output2<'py>> {
         if !distance.is_finite() {
             return Err(DataError::new_err(format!("distance is {distance}; it must be a finite number in mm")));
         }
@@ -171,13 +219,4 @@ fn plane(name: &str) -> PyResult<PlaneProjection> {
             )));
         }
     })
-}
-
-/// Measured points of a file: text, PLY, or the map of an interferometer or a profilometer. The array is (N, 3), in mm.
-///
-/// Raises DataError with the path, the place and the reason.
-#[pyfunction]
-pub(crate) fn read_points(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray2<f64>>> {
-    let read = py.detach(|| read_measured_with_notes(&path, &Table::default())).map_err(data)?;
-    Ok(vectors(py, read.points.iter().map(|point| point.coords).collect::<Vec<_>>().into_iter()))
 }

@@ -1,6 +1,5 @@
 //! Registration of measured points.
 
-use numpy::{PyArray1, PyArray2, ToPyArray};
 use pyo3::prelude::*;
 use regrind_core::geometry::Pose;
 use regrind_core::registration::{
@@ -8,7 +7,7 @@ use regrind_core::registration::{
 };
 use regrind_core::surface::DistanceModel;
 
-use super::arrays::{points, rows, square, vectors};
+use super::arrays::{ArrayLike, Output1, Output2, output, points, rows, square, vectors};
 use super::errors::{DataError, RegistrationError};
 use super::nominal::PyNominal;
 
@@ -30,35 +29,41 @@ pub(crate) struct PyRegistration {
 ///
 /// Raises DataError for arguments that cannot be used, and RegistrationError with the reason if the points cannot be
 /// registered.
+///
+/// >>> x = np.linspace(-20, 20, 81)
+/// >>> saddle = lambda x, y: 4e-3 * x**2 - 3e-3 * y**2 + 1e-4 * x**3 + 8e-5 * x * y**2
+/// >>> nominal = regrind.Nominal.from_function(saddle, x, x)
+/// >>> measured = nominal.offset(1.5)[::7] + [3, 2, 1]
+/// >>> found = regrind.register(nominal, measured, probe_radius=1.5)
+/// >>> found.pose[:3, 3].round(5)
+/// array([3., 2., 1.])
 #[pyfunction]
-#[pyo3(signature = (nominal, measured, *, probe_radius, side = "auto", lock = "", loss = "none", initial = None,
-    method = "offset", distance = "curved", outlier_sigmas = 6.0, max_rms = None))]
+#[pyo3(signature = (nominal, measured, *, probe_radius, side: "Literal['auto', 'above', 'below']" = "auto", lock = "",
+    loss: "Literal['none', 'huber', 'tukey']" = "none", initial = None,
+    method: "Literal['offset', 'contact', 'subtract-radius']" = "offset",
+    distance: "Literal['curved', 'triangle']" = "curved", outlier_sigmas = 6.0, max_rms = None))]
 #[expect(clippy::too_many_arguments, reason = "Python names each of them")]
 pub(crate) fn register(
     py: Python,
     nominal: &PyNominal,
-    measured: &Bound<PyAny>,
+    measured: ArrayLike,
     probe_radius: f64,
     side: &str,
     lock: &str,
     loss: &str,
-    initial: Option<&Bound<PyAny>>,
+    initial: Option<ArrayLike>,
     method: &str,
     distance: &str,
     outlier_sigmas: f64,
     max_rms: Option<f64>,
 ) -> PyResult<PyRegistration> {
-    let measured = points(measured, "measured")?;
+    let measured = points(&measured.0, "measured")?;
     let locked = locked(lock)?;
     let start = match initial {
-        Some(rows) => Start::Pose(pose(rows)?),
+        Some(rows) => Start::Pose(pose(&rows.0)?),
         None if locked.is_empty() => Start::Search,
         // A search would choose the locked coordinates at random.
         None => Start::Pose(Pose::identity()),
-    };
-    let above_zero = |name: &str, value: f64| match value > 0.0 {
-        true => Ok(value),
-        false => Err(DataError::new_err(format!("{name} is {value}; it must be above 0"))),
     };
     if !(probe_radius >= 0.0 && probe_radius.is_finite()) {
         return Err(DataError::new_err(format!(
@@ -85,7 +90,7 @@ const METHODS: [(&str, Method); 3] =
 const DISTANCES: [(&str, DistanceModel); 2] =
     [("curved", DistanceModel::Curved), ("triangle", DistanceModel::Triangle)];
 const LOSSES: [(&str, Loss); 3] = [("none", Loss::None), ("huber", Loss::Huber), ("tukey", Loss::Tukey)];
-const SIDES: [(&str, ProbeSide); 3] =
+pub(crate) const SIDES: [(&str, ProbeSide); 3] =
     [("auto", ProbeSide::Auto), ("above", ProbeSide::Above), ("below", ProbeSide::Below)];
 const COORDINATES: [(&str, Coordinate); 6] = [
     ("x", Coordinate::X),
@@ -96,7 +101,16 @@ const COORDINATES: [(&str, Coordinate); 6] = [
     ("rz", Coordinate::Rz),
 ];
 
-fn choice<T: Copy>(name: &str, given: &str, of: &[(&str, T)]) -> PyResult<T> {
+/// Returns a number that must be above 0; the text of a refusal names it by `name`.
+pub(crate) fn above_zero(name: &str, value: f64) -> PyResult<f64> {
+    match value > 0.0 {
+        true => Ok(value),
+        false => Err(DataError::new_err(format!("{name} is {value}; it must be above 0"))),
+    }
+}
+
+/// Returns the value of one of the words of an argument; the text of a refusal names it by `name`.
+pub(crate) fn choice<T: Copy>(name: &str, given: &str, of: &[(&str, T)]) -> PyResult<T> {
     of.iter().find(|(word, _)| *word == given).map(|(_, value)| *value).ok_or_else(|| {
         let words: Vec<String> = of.iter().map(|(word, _)| format!("{word:?}")).collect();
         DataError::new_err(format!("{name} is {given:?}; it must be one of {}", words.join(", ")))
@@ -123,14 +137,14 @@ fn pose(given: &Bound<PyAny>) -> PyResult<Pose> {
 impl PyRegistration {
     /// Pose that maps coordinates of the model to coordinates of the measuring machine, (4, 4), in mm: g of the method.
     #[getter]
-    fn pose<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+    fn pose<'py>(&self, py: Python<'py>) -> Output2<'py> {
         square(py, self.found.cmm_from_model.to_rows())
     }
 
     /// Covariance of the pose, (6, 6): of the twist [translation; rotation] in the model frame, in mm and rad. Locked and
     /// undetermined directions have no variance.
     #[getter]
-    fn covariance<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+    fn covariance<'py>(&self, py: Python<'py>) -> Output2<'py> {
         let covariance = &self.found.quality.covariance;
         square::<6>(py, std::array::from_fn(|row| std::array::from_fn(|column| covariance[(row, column)])))
     }
@@ -144,33 +158,33 @@ impl PyRegistration {
     /// Signed deviation of each measured point from the nominal surface in mm, (N,), in the order given; positive where
     /// material stands proud.
     #[getter]
-    fn deviations<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        self.found.deviations.iter().map(|of| of.deviation_mm).collect::<Vec<_>>().to_pyarray(py)
+    fn deviations<'py>(&self, py: Python<'py>) -> Output1<'py> {
+        output(py, self.found.deviations.iter().map(|of| of.deviation_mm).collect())
     }
 
     /// Standard uncertainty of each deviation in mm, (N,).
     #[getter]
-    fn uncertainty<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        self.found.deviations.iter().map(|of| of.uncertainty_mm).collect::<Vec<_>>().to_pyarray(py)
+    fn uncertainty<'py>(&self, py: Python<'py>) -> Output1<'py> {
+        output(py, self.found.deviations.iter().map(|of| of.uncertainty_mm).collect())
     }
 
     /// Contact points in the model frame in mm, (N, 3).
     #[getter]
-    fn points<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+    fn points<'py>(&self, py: Python<'py>) -> Output2<'py> {
         vectors(py, self.found.deviations.iter().map(|of| of.point.coords))
     }
 
     /// Unit normals of the nominal surface at the contact points, (N, 3).
     #[getter]
-    fn normals<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+    fn normals<'py>(&self, py: Python<'py>) -> Output2<'py> {
         vectors(py, self.found.deviations.iter().map(|of| of.normal))
     }
 
     /// True for each point that counts in every figure, (N,).
     #[getter]
-    fn used<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<bool>> {
+    fn used<'py>(&self, py: Python<'py>) -> Output1<'py, bool> {
         let used = self.found.deviations.iter().map(|of| of.status == PointStatus::Inlier);
-        used.collect::<Vec<_>>().to_pyarray(py)
+        output(py, used.collect())
     }
 
     /// Indices of the points that were left out, with the reason: "outlier" or "off part".
@@ -208,6 +222,12 @@ impl PyRegistration {
         self.found.quality.iterations
     }
 
+    /// Sum of the squared deviations after each step that was tried, in mm²; eq. (15).
+    #[getter]
+    fn objectives<'py>(&self, py: Python<'py>) -> Output1<'py> {
+        output(py, self.found.trace.iter().map(|step| step.objective_mm2).collect())
+    }
+
     /// Sum of the squared deviations of the used points, in mm²; eq. (7).
     #[getter]
     fn objective(&self) -> f64 {
@@ -222,7 +242,7 @@ impl PyRegistration {
 
     /// Other poses that fit about as well, each with its rms in mm for a sample of the points.
     #[getter]
-    fn alternatives<'py>(&self, py: Python<'py>) -> Vec<(Bound<'py, PyArray2<f64>>, f64)> {
+    fn alternatives<'py>(&self, py: Python<'py>) -> Vec<(Output2<'py>, f64)> {
         self.found.quality.alternatives.iter().map(|(pose, rms)| (square(py, pose.to_rows()), *rms)).collect()
     }
 

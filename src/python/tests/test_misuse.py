@@ -87,9 +87,9 @@ def test_files_are_refused(tmp_path, content):
     with pytest.raises(regrind.DataError, match="points.csv"):
         regrind.Nominal.from_file(path)
     with pytest.raises(regrind.DataError, match="points.csv"):
-        regrind.read_points(path)
+        regrind.read(path)
     with pytest.raises(regrind.DataError):
-        regrind.read_points(tmp_path / "missing.csv")
+        regrind.read(tmp_path / "missing.csv")
 
 
 @pytest.mark.parametrize("triangles", [[[0, 1, 99]], [[0, 1, -1]], [[0, 1, 1.5]], [[0, 1]], []])

@@ -67,7 +67,7 @@ def test_nominal_from_every_source(tmp_path, nominal, centres):
     points = nominal.points
     np.savetxt(tmp_path / "nominal.csv", points, delimiter=",", fmt="%.17g", header="x,y,z", comments="")
     np.savetxt(tmp_path / "measured.csv", centres, delimiter=",", fmt="%.17g", header="x,y,z", comments="")
-    measured = regrind.read_points(tmp_path / "measured.csv")
+    measured = regrind.read(tmp_path / "measured.csv")
     assert (measured == centres).all()
     index = np.arange(len(points)).reshape(121, 161)
     corners = [index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]]
