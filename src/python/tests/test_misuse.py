@@ -1,6 +1,7 @@
 """Misuse: each is a typed exception with the value, and none ends the interpreter or leaks."""
 
 import resource
+import threading
 
 import numpy as np
 import pytest
@@ -108,6 +109,62 @@ def test_functions_are_refused(returned):
 def test_exception_of_a_function_is_passed_on():
     with pytest.raises(ZeroDivisionError):
         regrind.Nominal.from_function(lambda x, y: 1 / 0, np.arange(9.0), np.arange(7.0))
+
+
+def test_array_that_changes_meanwhile_is_refused_or_used(nominal, centres):
+    """Another thread writes NaN into the array: each call refuses it or has copied it before."""
+    measured, stop, told = centres.copy(), threading.Event(), []
+
+    def spoil() -> None:
+        while not stop.is_set():
+            measured[7] = np.nan
+            measured[7] = centres[7]
+
+    spoiler = threading.Thread(target=spoil)
+    spoiler.start()
+    for _ in range(30):
+        try:
+            told.append(np.isfinite(regrind.register(nominal, measured, probe_radius=PROBE_RADIUS).rms))
+        except regrind.DataError as refused:
+            told.append("row 7" in str(refused))
+    stop.set()
+    spoiler.join()
+    assert len(told) == 30 and all(told)
+
+
+@pytest.mark.parametrize("radius", [-1.0, float("nan"), 1e3])
+def test_threads_are_refused_side_by_side(nominal, centres, radius):
+    refusals: list[str] = []
+
+    def misuse() -> None:
+        try:
+            regrind.register(nominal, centres, probe_radius=radius)
+        except regrind.RegrindError as refused:
+            refusals.append(str(refused))
+
+    threads = [threading.Thread(target=misuse) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(refusals) == 8 and len(set(refusals)) == 1
+
+
+def test_ten_thousand_registrations_leak_nothing():
+    x = np.linspace(-20.0, 20.0, 9)
+    small = regrind.Nominal.from_function(lambda x, y: 4e-3 * x**2 - 3e-3 * y**2 + 1e-4 * x**3 + 8e-5 * x * y**2, x, x)
+    measured = small.offset(1.0)[12:-12:2]
+
+    def often(count: int) -> int:
+        for _ in range(count):
+            found = regrind.register(small, measured, probe_radius=1.0, initial=np.eye(4))
+        assert found.rms < 1e-6
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+    before = often(1000)
+    after = often(9000)
+    # 4 kB kept by each call would be 36 MB.
+    assert after - before < 10_000, f"{after - before} kB more"
 
 
 def test_ten_thousand_refusals_and_calls_leak_nothing(nominal, centres):
