@@ -4,6 +4,7 @@ use std::convert::Infallible;
 
 use numpy::ndarray::{Array1, Array2, Dimension, Ix1, Ix2};
 use numpy::{AllowTypeChange, Element, IntoPyArray, PyArray, PyArrayLike2};
+use pyo3::exceptions::PyOverflowError;
 use pyo3::inspect::PyStaticExpr;
 use pyo3::prelude::*;
 use regrind_core::geometry::{Grid, Point, Vector};
@@ -84,11 +85,7 @@ pub(crate) fn output2<T: NamedElement>(py: Python<'_>, shape: (usize, usize), va
 pub(crate) fn rows<'py>(given: &Bound<'py, PyAny>, name: &str) -> PyResult<PyArrayLike2<'py, f64, AllowTypeChange>> {
     let wrong =
         |what: String| DataError::new_err(format!("{name} {what}; it must be an array of real numbers with two axes"));
-    let array = given
-        .py()
-        .import("numpy")?
-        .call_method1("asarray", (given,))
-        .map_err(|error| wrong(format!("is not an array ({error})")))?;
+    let array = unmasked(given).map_err(|error| wrong(format!("is not an array ({error})")))?;
     let kind: String = array.getattr("dtype")?.getattr("kind")?.extract()?;
     if !["f", "i", "u"].contains(&kind.as_str()) {
         return Err(wrong(format!("has the type {}", array.getattr("dtype")?)));
@@ -99,18 +96,72 @@ pub(crate) fn rows<'py>(given: &Bound<'py, PyAny>, name: &str) -> PyResult<PyArr
     array.extract().map_err(|error: PyErr| wrong(format!("cannot be read ({error})")))
 }
 
+/// Returns an argument as an array; NaN stands for what is masked.
+fn unmasked<'py>(given: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+    let py = given.py();
+    let masked = py.import("numpy.ma")?;
+    if !masked.call_method1("isMaskedArray", (given,))?.extract::<bool>()? {
+        return py.import("numpy")?.call_method1("asarray", (given,));
+    }
+    given.call_method1("astype", ("float64",))?.call_method1("filled", (f64::NAN,))
+}
+
+/// Reads an argument as two finite numbers, such as a place; one number counts for both.
+///
+/// # Errors
+/// The argument is neither. The text names it by `name`.
+pub(crate) fn pair(given: &ArrayLike, name: &str) -> PyResult<[f64; 2]> {
+    let wrong = || DataError::new_err(format!("{name} is {}; it must be two finite numbers (x, y) in mm", given.0));
+    let flat = given.0.py().import("numpy")?.call_method1("ravel", (&given.0,)).map_err(|_| wrong())?;
+    let numbers = flat.extract::<Vec<f64>>().map_err(|_| wrong())?;
+    match numbers[..] {
+        [one] if one.is_finite() => Ok([one, one]),
+        [x, y] if x.is_finite() && y.is_finite() => Ok([x, y]),
+        _ => Err(wrong()),
+    }
+}
+
+/// Argument that is a whole number. One that no machine can hold is the nearest that it can.
+pub(crate) struct Whole(pub(crate) i64);
+
+impl<'py> FromPyObject<'_, 'py> for Whole {
+    type Error = PyErr;
+
+    const INPUT_TYPE: PyStaticExpr = name(&PyStaticExpr::Name { id: "typing" }, "SupportsIndex");
+
+    fn extract(given: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        match given.extract::<i64>() {
+            Err(error) if error.is_instance_of::<PyOverflowError>(given.py()) => {
+                Ok(Self(if given.lt(0)? { i64::MIN } else { i64::MAX }))
+            }
+            read => read.map(Self),
+        }
+    }
+}
+
+impl Whole {
+    /// Returns the number.
+    ///
+    /// # Errors
+    /// It is below `least` or above `most`. The text names it by `name`.
+    pub(crate) fn within(&self, name: &str, least: usize, most: usize) -> PyResult<usize> {
+        let number = usize::try_from(self.0).ok().filter(|number| (least..=most).contains(number));
+        number.ok_or_else(|| DataError::new_err(format!("{name} is {}; it must be {least} to {most}", self.0)))
+    }
+}
+
 /// Reads an argument as an array with one axis, as [`rows`] reads one with two.
 ///
 /// # Errors
 /// As [`rows`].
 pub(crate) fn column(given: &Bound<PyAny>, name: &str) -> PyResult<Vec<f64>> {
-    let numpy = given.py().import("numpy")?;
-    let column = numpy.call_method1("asarray", (given,)).and_then(|array| array.call_method1("reshape", ((-1, 1),)));
-    let is_flat = numpy.call_method1("ndim", (given,)).and_then(|axes| axes.extract::<usize>());
-    match (column, is_flat) {
-        (Ok(column), Ok(1)) => Ok(rows(&column, name)?.as_array().iter().copied().collect()),
-        _ => Err(DataError::new_err(format!("{name} must be an array of real numbers with one axis: (N,)"))),
+    let wrong = || DataError::new_err(format!("{name} must be an array of real numbers with one axis: (N,)"));
+    let array = unmasked(given).map_err(|_| wrong())?;
+    if array.getattr("ndim")?.extract::<usize>()? != 1 {
+        return Err(wrong());
     }
+    let column = array.call_method1("reshape", ((-1, 1),))?;
+    Ok(rows(&column, name).map_err(|_| wrong())?.as_array().iter().copied().collect())
 }
 
 /// Reads an argument as points: an array with one row of x, y, z for each, in mm.

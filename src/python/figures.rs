@@ -5,7 +5,7 @@ use regrind_core::compensation::{ErrorMap, FilterOrder, MapOptions, Smoothing, f
 use regrind_core::form::{FormOptions, Iso10110, PolynomialBasis, PolynomialFit, compute_figures, fit_polynomials};
 use regrind_core::geometry::{Aperture, DeviationSample, Grid, GridMap};
 
-use super::arrays::{ArrayLike, Output1, Output2, axis_places_mm, column, on_grid, output, rows};
+use super::arrays::{ArrayLike, Output1, Output2, Whole, axis_places_mm, column, on_grid, output, pair, rows};
 use super::errors::{DataError, data};
 
 /// Power, irregularity and symmetric part by ISO 10110-5, in nanometres.
@@ -16,6 +16,16 @@ pub(crate) struct PyIso10110 {
 
 #[pymethods]
 impl PyIso10110 {
+    /// Returns the same object: it never changes.
+    fn __copy__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    /// Returns the same object: it never changes.
+    fn __deepcopy__(slf: Py<Self>, _memo: &Bound<PyAny>) -> Py<Self> {
+        slf
+    }
+
     /// A: peak to valley of the power, in nm.
     #[getter]
     fn power_nm(&self) -> f64 {
@@ -59,6 +69,16 @@ pub(crate) struct PyPolynomialFit {
 
 #[pymethods]
 impl PyPolynomialFit {
+    /// Returns the same object: it never changes.
+    fn __copy__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    /// Returns the same object: it never changes.
+    fn __deepcopy__(slf: Py<Self>, _memo: &Bound<PyAny>) -> Py<Self> {
+        slf
+    }
+
     /// Coefficients in mm, (K,); each polynomial has the mean square 1 over the full disc.
     #[getter]
     fn coefficients<'py>(&self, py: Python<'py>) -> Output1<'py> {
@@ -99,6 +119,16 @@ pub(crate) struct PyErrorMap {
 
 #[pymethods]
 impl PyErrorMap {
+    /// Returns the same object: it never changes.
+    fn __copy__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    /// Returns the same object: it never changes.
+    fn __deepcopy__(slf: Py<Self>, _memo: &Bound<PyAny>) -> Py<Self> {
+        slf
+    }
+
     /// Places of the columns along x in mm, (M,).
     #[getter]
     fn x<'py>(&self, py: Python<'py>) -> Output1<'py> {
@@ -120,10 +150,13 @@ impl PyErrorMap {
         self.array(py, known.collect())
     }
 
-    /// Standard uncertainty of the error at each node from the noise of the points in mm, (N, M).
+    /// Standard uncertainty of the error at each node from the noise of the points in mm, (N, M); NaN where the error is.
     #[getter]
     fn uncertainty<'py>(&self, py: Python<'py>) -> Output2<'py> {
-        self.array(py, self.map.sigma_mm.clone())
+        let nodes = &self.map.nodes;
+        let known =
+            self.map.sigma_mm.iter().zip(&nodes.valid).map(|(sigma, valid)| if *valid { *sigma } else { f64::NAN });
+        self.array(py, known.collect())
     }
 
     /// Standard deviation of the deviations from the map in mm: the part that the filter removed.
@@ -163,8 +196,8 @@ impl PyErrorMap {
 /// Figures of ISO 10110-5 of deviations, without piston and tilt.
 ///
 /// Shapes: `places` is (N, 2) or (N, 3), of which x and y are used, in mm; `deviations` is (N,), in mm. `radius` is that of
-/// a round part about `centre`, in mm; without it, the centre is that of the bounds of the points. `wavelength` is in mm
-/// and only appears in the notation.
+/// a round part about `centre`, by default the origin, in mm; without it, the centre is that of the bounds of the points.
+/// `wavelength` is in mm and only appears in the notation.
 ///
 /// Raises DataError if the points do not determine the figures.
 ///
@@ -173,25 +206,36 @@ impl PyErrorMap {
 /// >>> round(regrind.iso10110(places, 1e-5 * (x**2 + y**2).ravel()).power_nm)
 /// 2000
 #[pyfunction]
-#[pyo3(signature = (places, deviations, *, radius = None, centre = [0.0, 0.0], wavelength = 632.8e-6))]
+#[pyo3(signature = (places, deviations, *, radius = None, centre = None, wavelength = 632.8e-6))]
 pub(crate) fn iso10110(
     py: Python,
     places: ArrayLike,
     deviations: ArrayLike,
     radius: Option<f64>,
-    centre: [f64; 2],
+    centre: Option<ArrayLike>,
     wavelength: f64,
 ) -> PyResult<PyIso10110> {
     let samples = samples(&places.0, &deviations.0)?;
-    let aperture = radius.map(|radius_mm| disc(radius_mm, centre)).transpose()?;
-    let options = FormOptions { aperture, wavelength_nm: 1e6 * wavelength, ..FormOptions::default() };
+    let aperture = match radius {
+        Some(radius_mm) => Some(disc(radius_mm, centre)?),
+        None if centre.is_some() => {
+            return Err(DataError::new_err("centre is given without radius; give both or none"));
+        }
+        None => None,
+    };
+    if !(1e-5..=0.1).contains(&wavelength) {
+        return Err(DataError::new_err(format!("wavelength is {wavelength}; it must be 1e-5 to 0.1 mm")));
+    }
+    // In picometres it is a whole number, as drawings state it.
+    let wavelength_nm = (1e9 * wavelength).round() / 1e3;
+    let options = FormOptions { aperture, wavelength_nm, ..FormOptions::default() };
     let figures = py.detach(|| compute_figures(&samples, &options)).map_err(data)?;
     Ok(PyIso10110 { iso: figures.iso_10110 })
 }
 
 /// Fits Fringe Zernike polynomials to deviations by least squares at the places of the points.
 ///
-/// Shapes: `places` is (N, 2) or (N, 3), in mm; `deviations` is (N,), in mm. `radius` and `centre` are those of the disc, in
+/// Shapes: `places` is (N, 2) or (N, 3), in mm; `deviations` is (N,), in mm. `radius` and `centre` are those of the disc, by default about the origin, in
 /// mm. `terms` is the number of polynomials, 1 to 37.
 ///
 /// Raises DataError if the points do not determine the polynomials.
@@ -202,15 +246,16 @@ pub(crate) fn iso10110(
 /// >>> fit.terms[1], (1e6 * fit.coefficients[1]).round(3).item()
 /// ('Z2 (1, 1)', 50.0)
 #[pyfunction]
-#[pyo3(signature = (places, deviations, *, radius, centre = [0.0, 0.0], terms = 36))]
+#[pyo3(signature = (places, deviations, *, radius, centre = None, terms = 36))]
 pub(crate) fn zernike_fit(
     py: Python,
     places: ArrayLike,
     deviations: ArrayLike,
     radius: f64,
-    centre: [f64; 2],
-    terms: usize,
+    centre: Option<ArrayLike>,
+    terms: i64,
 ) -> PyResult<PyPolynomialFit> {
+    let terms = Whole(terms).within("terms", 1, 37)?;
     let samples = samples(&places.0, &deviations.0)?;
     let basis = PolynomialBasis::zernike(&disc(radius, centre)?);
     let fit = py.detach(|| fit_polynomials(&basis, terms, &samples)).map_err(data)?;
@@ -241,6 +286,7 @@ pub(crate) fn error_map(
     robust: bool,
 ) -> PyResult<PyErrorMap> {
     let samples = samples(&places.0, &deviations.0)?;
+    let cutoff = cutoff_within(cutoff)?;
     let smoothing = if robust { Smoothing::RobustGaussian } else { Smoothing::Gaussian };
     let options = MapOptions { smoothing, ..MapOptions::new(cutoff, spacing.unwrap_or(0.2 * cutoff)) };
     let map = py.detach(|| regrind_core::compensation::error_map(&samples, &options)).map_err(data)?;
@@ -249,10 +295,10 @@ pub(crate) fn error_map(
 
 /// Filters a map of heights by the areal Gaussian filter of ISO 16610-61.
 ///
-/// Shapes: `values` is (N, M); NaN marks nodes without a value. `spacing` is the distance of the nodes along x and y, and
+/// Shapes: `values` is (N, M); NaN marks nodes without a value. `spacing` is the distance of the nodes along x and y, or one number for both, and
 /// `cutoff` the wavelength at which half of the amplitude passes, in mm. `order` is that of the polynomial that passes
 /// unchanged: 0, 1 or 2. `robust` selects the robust filter of ISO 16610-71. The result is (N, M); nodes with too few
-/// values around them are NaN.
+/// values around them are NaN. A node without a value gets that of the filter if enough nodes around it have one.
 ///
 /// Raises DataError for arguments that cannot be used.
 ///
@@ -264,21 +310,22 @@ pub(crate) fn error_map(
 pub(crate) fn gaussian<'py>(
     py: Python<'py>,
     values: ArrayLike<'py>,
-    spacing: [f64; 2],
+    spacing: ArrayLike,
     cutoff: f64,
-    order: u8,
+    order: i64,
     robust: bool,
 ) -> PyResult<Output2<'py>> {
+    let spacing = pair(&spacing, "spacing")?;
+    let cutoff = cutoff_within(cutoff)?;
     let heights = rows(&values.0, "values")?;
     let heights = heights.as_array();
-    let order = match order {
+    let order = match Whole(order).within("order", 0, 2)? {
         0 => FilterOrder::Constant,
         1 => FilterOrder::Plane,
-        2 => FilterOrder::Quadric,
-        _ => return Err(DataError::new_err(format!("order is {order}; it must be 0, 1 or 2"))),
+        _ => FilterOrder::Quadric,
     };
-    if !spacing.iter().all(|mm| *mm > 0.0 && mm.is_finite()) {
-        return Err(DataError::new_err(format!("spacing is {spacing:?}; both must be finite numbers above 0, in mm")));
+    if spacing.iter().any(|mm| *mm <= 0.0) {
+        return Err(DataError::new_err(format!("spacing is {spacing:?}; both must be above 0, in mm")));
     }
     let grid = Grid { columns: heights.ncols(), rows: heights.nrows(), first_mm: [0.0, 0.0], spacing_mm: spacing };
     let values_mm: Vec<f64> = heights.iter().copied().collect();
@@ -290,7 +337,15 @@ pub(crate) fn gaussian<'py>(
     Ok(on_grid(py, &grid, known.collect()))
 }
 
-fn disc(radius_mm: f64, centre_mm: [f64; 2]) -> PyResult<Aperture> {
+fn cutoff_within(cutoff: f64) -> PyResult<f64> {
+    match cutoff > 0.0 && cutoff <= 1e6 {
+        true => Ok(cutoff),
+        false => Err(DataError::new_err(format!("cutoff is {cutoff}; it must be above 0, and 1e6 mm at most"))),
+    }
+}
+
+fn disc(radius_mm: f64, centre: Option<ArrayLike>) -> PyResult<Aperture> {
+    let centre_mm = centre.map_or(Ok([0.0, 0.0]), |centre| pair(&centre, "centre"))?;
     if radius_mm > 0.0 && radius_mm.is_finite() && centre_mm.iter().all(|c| c.is_finite()) {
         Ok(Aperture::Circle { centre_mm, radius_mm })
     } else {

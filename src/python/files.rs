@@ -10,7 +10,7 @@ use regrind_formats::{
     write_deviations, write_error_map, write_error_map_x3p, write_points,
 };
 
-use super::arrays::{Output2, points, vectors};
+use super::arrays::{Output2, Whole, points, vectors};
 use super::errors::{DataError, data};
 use super::figures::PyErrorMap;
 use super::nominal::PyNominal;
@@ -53,10 +53,11 @@ pub(crate) fn write(
     path: PathBuf,
     what: &Bound<PyAny>,
     nominal: Option<&PyNominal>,
-    cycle: u32,
+    cycle: i64,
     dialect: &str,
     controller_tolerance: Option<f64>,
 ) -> PyResult<()> {
+    let cycle = Whole(cycle).within("cycle", 0, 65_535)?;
     let part = || {
         nominal.map(PyNominal::identity).ok_or_else(|| {
             DataError::new_err(format!("{}: nominal is missing; the file states its part", path.display()))
@@ -77,7 +78,7 @@ pub(crate) fn write(
             let date: String = now.call_method1("strftime", ("%Y-%m-%dT%H:%M:%SZ",))?.extract()?;
             return py.detach(|| write_error_map_x3p(&path, map, &date, false)).map_err(data);
         }
-        let origin = ErrorMapOrigin { part: part()?, cycle, ground_with: None };
+        let origin = ErrorMapOrigin { part: part()?, cycle: cycle as u32, ground_with: None };
         return py.detach(|| write_error_map(&path, map, &origin, false)).map_err(data);
     }
     if let Ok(correction) = what.cast::<PyCorrection>() {
@@ -91,6 +92,9 @@ pub(crate) fn write(
         return py.detach(|| save_program(&path, program, dialect, controller_tolerance));
     }
     let points = points(what, "what")?;
+    if points.is_empty() {
+        return Err(DataError::new_err(format!("{}: what has no point", path.display())));
+    }
     py.detach(|| write_points(&path, "x_mm,y_mm,z_mm", &points)).map_err(data)
 }
 

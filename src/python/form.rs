@@ -4,7 +4,7 @@ use pyo3::prelude::*;
 use regrind_core::model::{Form, ModelInputs};
 use regrind_figures::Interval;
 
-use super::arrays::{Output1, Output2, output, output2, square};
+use super::arrays::{Output1, Output2, Whole, output, output2, square};
 use super::errors::{DataError, ModelError};
 use super::registration::PyRegistration;
 
@@ -22,6 +22,16 @@ pub(crate) struct PyInterval {
 
 #[pymethods]
 impl PyInterval {
+    /// Returns the same object: it never changes.
+    fn __copy__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    /// Returns the same object: it never changes.
+    fn __deepcopy__(slf: Py<Self>, _memo: &Bound<PyAny>) -> Py<Self> {
+        slf
+    }
+
     fn __repr__(&self) -> String {
         let [median, low, high] = [self.median, self.low, self.high].map(|mm| 1e3 * mm);
         format!("Interval({median:.3} um, {low:.3} to {high:.3})")
@@ -34,7 +44,7 @@ impl From<&Interval> for PyInterval {
     }
 }
 
-/// Form of a part with its figures and their uncertainty.
+/// Form of a part after its own best fit, with its figures and their uncertainty.
 #[pyclass(name = "Form", module = "regrind", frozen)]
 pub(crate) struct PyForm {
     form: Form,
@@ -43,15 +53,17 @@ pub(crate) struct PyForm {
     inputs: ModelInputs,
 }
 
-/// Maximum number of values of all samples of one call: 800 MB.
-const MAX_SAMPLED_VALUES: usize = 100_000_000;
+/// Maximum number of values of all samples of one call: 160 MB. Twelve times as much is needed meanwhile.
+const MAX_SAMPLED_VALUES: usize = 20_000_000;
 
 /// Separates the form from the noise of the probe by a Gaussian process, and states PV and RMS with 95 % intervals.
 ///
 /// `radius_uncertainty` is the standard uncertainty of the radius of the probe in mm, and `length_uncertainty` the
 /// relative standard uncertainty of all lengths. No point can show them, so both are 0 unless they are stated.
 ///
-/// Raises ModelError with the reason if the deviations give no model.
+/// The form is that after its best fit: the motion of the part that is closest to it does not count.
+///
+/// Raises DataError for an uncertainty beyond its limit, and ModelError with the reason if the deviations give no model.
 ///
 /// >>> x = np.linspace(-20, 20, 81)
 /// >>> saddle = lambda x, y: 4e-3 * x**2 - 3e-3 * y**2 + 1e-4 * x**3 + 8e-5 * x * y**2
@@ -69,6 +81,12 @@ pub(crate) fn model(
     radius_uncertainty: f64,
     length_uncertainty: f64,
 ) -> PyResult<PyForm> {
+    let within = |name: &str, value: f64, most: f64, unit: &str| match (0.0..=most).contains(&value) {
+        true => Ok(value),
+        false => Err(DataError::new_err(format!("{name} is {value}; it must be 0 to {most}{unit}"))),
+    };
+    let radius_uncertainty = within("radius_uncertainty", radius_uncertainty, 1.0, " mm")?;
+    let length_uncertainty = within("length_uncertainty", length_uncertainty, 0.1, ", a share of each length")?;
     let inputs =
         ModelInputs { radius_sigma_mm: radius_uncertainty, scale_sigma: length_uncertainty, ..ModelInputs::default() };
     let found = &registration.get().found;
@@ -82,6 +100,16 @@ fn refused(error: regrind_core::model::ModelError) -> PyErr {
 
 #[pymethods]
 impl PyForm {
+    /// Returns the same object: it never changes.
+    fn __copy__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    /// Returns the same object: it never changes.
+    fn __deepcopy__(slf: Py<Self>, _memo: &Bound<PyAny>) -> Py<Self> {
+        slf
+    }
+
     /// Peak to valley at the used points.
     #[getter]
     fn pv(&self) -> PyInterval {
@@ -112,6 +140,13 @@ impl PyForm {
         self.form.is_detected
     }
 
+    /// Places of these points over x and y of the model frame in mm, (M, 2).
+    #[getter]
+    fn places<'py>(&self, py: Python<'py>) -> Output2<'py> {
+        let flat: Vec<f64> = self.form.points.iter().flat_map(|of| of.place_mm).collect();
+        output2(py, (self.form.points.len(), 2), flat)
+    }
+
     /// Form at each used point in mm, (M,). A scan of more than 6,000 points is reduced to 6,000.
     #[getter]
     fn values<'py>(&self, py: Python<'py>) -> Output1<'py> {
@@ -134,12 +169,9 @@ impl PyForm {
     /// Samples of the form from its posterior at the same points in mm, (`count`, M). Each row is a form that the
     /// points allow. The same `count` gives the same samples; 1000 are those from which the figures come.
     ///
-    /// Raises DataError for 0 samples, and for more than 1e8 values.
-    fn sample<'py>(&self, py: Python<'py>, count: usize) -> PyResult<Output2<'py>> {
-        let most = MAX_SAMPLED_VALUES / self.form.points.len().max(1);
-        if !(1..=most).contains(&count) {
-            return Err(DataError::new_err(format!("count is {count}; it must be 1 to {most} for so many points")));
-        }
+    /// Raises DataError for 0 samples, and for more than 2e7 values.
+    fn sample<'py>(&self, py: Python<'py>, count: Whole) -> PyResult<Output2<'py>> {
+        let count = count.within("count", 1, MAX_SAMPLED_VALUES / self.form.points.len().max(1))?;
         let found = &self.registration.get().found;
         let samples = py.detach(|| Form::sample(found, &self.inputs, count)).map_err(refused)?;
         // Samples are columns, one after the other: the rows of the array.

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::sync::OnceLock;
 
 use pyo3::prelude::*;
+use regrind_core::geometry::Point;
 use regrind_core::surface::{DefinedSurface, Nominal, NominalKind, PlaneProjection};
 use regrind_formats::{NominalFile, Table, read_nominal_with_identity};
 use sha2::{Digest, Sha256};
@@ -38,6 +39,16 @@ impl PyNominal {
 
 #[pymethods]
 impl PyNominal {
+    /// Returns the same object: it never changes.
+    fn __copy__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    /// Returns the same object: it never changes.
+    fn __deepcopy__(slf: Py<Self>, _memo: &Bound<PyAny>) -> Py<Self> {
+        slf
+    }
+
     /// Surface through points: a grid if the points form one, otherwise a triangulation.
     ///
     /// Shapes: `points` is (N, 3), in mm, in any order. `projection` selects the plane of the triangulation of scattered
@@ -52,6 +63,7 @@ impl PyNominal {
     #[pyo3(signature = (points, projection: "Literal['auto', 'xy', 'best-fit', 'spherical']" = "auto"))]
     fn from_points(py: Python, points: ArrayLike, projection: &str) -> PyResult<Self> {
         let points = self::points(&points.0, "points")?;
+        check_size(&points)?;
         let projection = plane(projection)?;
         let nominal = py.detach(|| Nominal::from_points(points, projection)).map_err(data)?;
         Ok(Self::new(nominal, None))
@@ -114,6 +126,7 @@ impl PyNominal {
             .outer_iter()
             .map(|row| Ok([corner(row[0])?, corner(row[1])?, corner(row[2])?]))
             .collect::<PyResult<_>>()?;
+        check_corners(&points, &triangles)?;
         let nominal = py
             .detach(|| {
                 let nominal = Nominal::from_mesh(points, triangles)?;
@@ -197,6 +210,42 @@ impl PyNominal {
             NominalKind::Patches { count } => format!("{count} patches"),
         };
         format!("Nominal({} points, {kind})", self.nominal.len())
+    }
+}
+
+/// Refuses points that are so close together that no surface of a part is meant.
+fn check_size(points: &[Point]) -> PyResult<()> {
+    const MIN_SIZE_MM: f64 = 1e-6;
+    let extent = |axis: usize| {
+        let (low, high) = points.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), point| {
+            (low.min(point[axis]), high.max(point[axis]))
+        });
+        high - low
+    };
+    let size_mm = (0..3).map(extent).fold(0.0, f64::max);
+    match points.is_empty() || size_mm >= MIN_SIZE_MM {
+        true => Ok(()),
+        false => {
+            Err(DataError::new_err(format!("points are within {size_mm:e} mm; a part has {MIN_SIZE_MM:e} mm at least")))
+        }
+    }
+}
+
+/// Refuses triangles without an area, and points that belong to no triangle.
+fn check_corners(points: &[Point], triangles: &[[u32; 3]]) -> PyResult<()> {
+    let mut is_corner = vec![false; points.len()];
+    for (k, corners) in triangles.iter().enumerate() {
+        let [a, b, c] = corners.map(|corner| points[corner as usize]);
+        if (b - a).cross(&(c - a)).norm() == 0.0 {
+            return Err(DataError::new_err(format!("triangles: row {k}, {corners:?}, has no area; remove it")));
+        }
+        corners.iter().for_each(|corner| is_corner[*corner as usize] = true);
+    }
+    match is_corner.iter().position(|is_corner| !is_corner) {
+        Some(k) if !triangles.is_empty() => {
+            Err(DataError::new_err(format!("points: row {k} belongs to no triangle; remove it")))
+        }
+        _ => Ok(()),
     }
 }
 

@@ -5,7 +5,7 @@ use regrind_core::compensation::path::{
     Move, PathOptions, PathSummary, TargetSurface, ToolPath, TrackPattern, TrackSpacing, Wheel, nominal_height_field,
 };
 use regrind_core::compensation::{Correction, CorrectionLimits, GainRule, LearningState, NextPass, PassObservation};
-use regrind_core::geometry::{Grid, Vector};
+use regrind_core::geometry::{Aperture, Grid, Vector};
 use regrind_core::registration::ProbeSide;
 use sha2::{Digest, Sha256};
 
@@ -23,6 +23,8 @@ const PATTERNS: [(&str, TrackPattern); 2] = [("raster", TrackPattern::Raster), (
 #[pyclass(name = "Correction", module = "regrind", frozen)]
 pub(crate) struct PyCorrection {
     pub(crate) next: NextPass,
+    /// Level of the first pass, from which the removal counts.
+    allowance_mm: f64,
     /// SHA-256 of the correction of the pass before.
     pub(crate) replaces: [u8; 32],
 }
@@ -35,6 +37,16 @@ impl PyCorrection {
 
 #[pymethods]
 impl PyCorrection {
+    /// Returns the same object: it never changes.
+    fn __copy__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    /// Returns the same object: it never changes.
+    fn __deepcopy__(slf: Py<Self>, _memo: &Bound<PyAny>) -> Py<Self> {
+        slf
+    }
+
     /// Places of the columns along x in mm, (M,).
     #[getter]
     fn x<'py>(&self, py: Python<'py>) -> Output1<'py> {
@@ -87,7 +99,7 @@ impl PyCorrection {
 /// Correction of the next pass: the last correction minus `gain` times the measured error, within limits.
 ///
 /// A pass can only remove material, so the next pass is deeper by `depth_of_cut` in mm, or by more where the correction
-/// rises. `previous` is the correction of the pass that was measured; without it, that pass had none, and its level was
+/// rises. `previous` is the correction of the pass that was measured; without it, that pass was the first, had none, and left
 /// `allowance` in mm. `max_correction` limits the correction at any place, `removal_budget` the removal below the first
 /// pass, `max_depth` the depth of the pass at any place, and `min_depth` is the least depth of cut at any place; all in
 /// mm.
@@ -100,7 +112,7 @@ impl PyCorrection {
 /// >>> regrind.compensate(map, depth_of_cut=0.02, max_correction=0.06, removal_budget=0.4)
 /// Correction(11 x 11 nodes, pass 2, depth 20.000 um)
 #[pyfunction]
-#[pyo3(signature = (error_map, *, depth_of_cut, max_correction, removal_budget, previous = None, allowance = 0.0,
+#[pyo3(signature = (error_map, *, depth_of_cut, max_correction, removal_budget, previous = None, allowance = None,
     gain = 1.0, min_depth = 0.0005, max_depth = None))]
 #[expect(clippy::too_many_arguments, reason = "Python names each of them")]
 pub(crate) fn compensate(
@@ -109,7 +121,7 @@ pub(crate) fn compensate(
     max_correction: f64,
     removal_budget: f64,
     previous: Option<&PyCorrection>,
-    allowance: f64,
+    allowance: Option<f64>,
     gain: f64,
     min_depth: f64,
     max_depth: Option<f64>,
@@ -121,6 +133,16 @@ pub(crate) fn compensate(
     if !(gain > 0.0 && gain <= 1.5) {
         return Err(DataError::new_err(format!("gain is {gain}; it must be above 0, and 1.5 at most")));
     }
+    let allowance = match (previous.map(|previous| previous.allowance_mm), allowance) {
+        (None, given) => given.unwrap_or(0.0),
+        (Some(known), None) => known,
+        (Some(known), Some(given)) if known == given => known,
+        (Some(known), Some(given)) => {
+            return Err(DataError::new_err(format!(
+                "allowance is {given}; that of the correction before is {known}, and it stays; leave it out"
+            )));
+        }
+    };
     let limits = CorrectionLimits {
         depth_of_cut_mm: from_zero("depth_of_cut", depth_of_cut)?,
         min_depth_mm: from_zero("min_depth", min_depth)?,
@@ -132,12 +154,40 @@ pub(crate) fn compensate(
     let grid = error_map.map.nodes.grid;
     let first = Correction::zero(grid, allowance);
     let last = previous.map_or(&first, PyCorrection::correction);
+    let seen_mm = bounds(&grid);
+    if previous.is_some() {
+        check_cover(&last.grid, seen_mm, "the correction before", "the error map")?;
+    }
     let extent_mm = [grid.columns, grid.rows].map(|count| count.saturating_sub(1) as f64);
     let size_mm = [extent_mm[0] * grid.spacing_mm[0], extent_mm[1] * grid.spacing_mm[1]];
     let known = LearningState::new(GainRule::Fixed(gain), &error_map.options, size_mm, None);
     let seen = PassObservation { correction: last, error: &error_map.map, response: None, explained: None };
     let next = last.next_pass(&error_map.map, &known.updated(&seen), None, &limits).map_err(data)?;
-    Ok(PyCorrection { next, replaces: identity(last) })
+    Ok(PyCorrection { next, allowance_mm: allowance, replaces: identity(last) })
+}
+
+/// Returns the lowest and the highest place of the nodes of a grid, in mm.
+fn bounds(grid: &Grid) -> [[f64; 2]; 2] {
+    [grid.place_mm(0), grid.place_mm(grid.len().saturating_sub(1))]
+}
+
+/// Refuses a grid that leaves out more than a tenth of an area on a side: beyond its edge a correction is constant, and
+/// one in other coordinates would be applied unseen.
+fn check_cover(grid: &Grid, [low, high]: [[f64; 2]; 2], of: &str, area: &str) -> PyResult<()> {
+    const MAX_SHARE: f64 = 0.1;
+    let [first, last] = bounds(grid);
+    for (k, axis) in ['x', 'y'].into_iter().enumerate() {
+        let out_mm = (first[k] - low[k]).max(high[k] - last[k]);
+        let limit_mm = MAX_SHARE * (high[k] - low[k]) + grid.spacing_mm[k];
+        if out_mm > limit_mm {
+            return Err(DataError::new_err(format!(
+                "{of} is from {axis} {:.3} to {:.3} mm and leaves out {out_mm:.3} mm of {area}, which is from {:.3} to {:.3} mm; at \
+                 most {limit_mm:.3} mm may be left out: are both in coordinates of the model?",
+                first[k], last[k], low[k], high[k]
+            )));
+        }
+    }
+    Ok(())
 }
 
 /// Returns the SHA-256 of a correction: of its grid and of its values.
@@ -161,10 +211,12 @@ pub(crate) struct PyToolPath {
 /// Path of the wheel over the nominal surface plus a correction.
 ///
 /// The wheel is a ball of `wheel_radius`, or with `rim_radius` a disc with a round rim whose spindle is along y; both in
-/// mm. `track` is the distance of the tracks in mm, or `scallop` is the greatest height in mm of the ridges between them.
+/// mm. `track` is the distance of the tracks in mm, or `scallop` is the height h in mm of the ridges between them, to first
+/// order: h = track² / (8 r), with 1/r the curvature of the wheel less that of the surface.
 /// `feed` is in mm/min. `pattern` is "raster" or "spiral". `side` is the side from which the wheel comes: "above" or
 /// "below". `chord_error` is the greatest distance of the lines between the points from the path in mm. `overrun` is the
-/// length of the tracks beyond the edge, and `safe_height` the height of rapid moves above the path, both in mm.
+/// length of the tracks beyond the edge, before which and after which the wheel comes down and lifts off along 2 mm more at
+/// feed; `safe_height` is the height of rapid moves above the path; both in mm.
 ///
 /// Raises DataError if the wheel does not fit the surface: the text says where, by how much, and what to do.
 ///
@@ -213,6 +265,12 @@ pub(crate) fn toolpath(
         safe_height_mm: safe_height,
         ..PathOptions::new(wheel, wheel_radius, feed)
     };
+    let within = |name: &str, value: f64, least: f64, most: f64| match (least..=most).contains(&value) {
+        true => Ok(()),
+        false => Err(DataError::new_err(format!("{name} is {value}; it must be {least} to {most} mm"))),
+    };
+    within("chord_error", chord_error, 1e-7, 1.0)?;
+    within("overrun", overrun, 0.0, 1000.0)?;
     let (path, summary, correction) = py.detach(|| {
         let (field, outline) = nominal_height_field(&nominal.nominal).map_err(data)?;
         let field = if from_below { field.mirrored() } else { field };
@@ -224,12 +282,30 @@ pub(crate) fn toolpath(
             },
             |given| given.correction().clone(),
         );
+        check_cover(&correction.grid, outline.bounds(), "the correction", "the part")?;
         let target = TargetSurface::new(field, &correction, wheel.reach_mm()).map_err(data)?;
+        check_length(&outline, &options)?;
         let path = ToolPath::new(target, outline, options).map_err(data)?;
         let summary = path.summary().map_err(data)?;
         Ok::<_, PyErr>((path, summary, correction))
     })?;
     Ok(PyToolPath { path, summary, correction, part_identity: nominal.identity() })
+}
+
+/// Refuses a path that is so long that nobody waits for it.
+fn check_length(outline: &Aperture, options: &PathOptions) -> PyResult<()> {
+    const MAX_LENGTH_MM: f64 = 2e7;
+    let TrackSpacing::Distance(track_mm) = options.spacing else { return Ok(()) };
+    let [low, high] = outline.bounds();
+    let length_mm = (high[0] - low[0]) * (high[1] - low[1]) / track_mm;
+    match length_mm <= MAX_LENGTH_MM {
+        true => Ok(()),
+        false => Err(DataError::new_err(format!(
+            "track is {track_mm}; the path would be {:.0} km long, limit {:.0} km; increase track",
+            1e-6 * length_mm,
+            1e-6 * MAX_LENGTH_MM
+        ))),
+    }
 }
 
 /// Returns a ball, or with `rim_radius` a disc with a round rim whose spindle is along y.
@@ -260,6 +336,16 @@ fn spacing(track: Option<f64>, scallop: Option<f64>, wheel_radius: f64) -> PyRes
 
 #[pymethods]
 impl PyToolPath {
+    /// Returns the same object: it never changes.
+    fn __copy__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    /// Returns the same object: it never changes.
+    fn __deepcopy__(slf: Py<Self>, _memo: &Bound<PyAny>) -> Py<Self> {
+        slf
+    }
+
     /// Places of the centre of the wheel at feed in the model frame in mm, (N, 3).
     ///
     /// Raises DataError for a path of more than 5e7 points.

@@ -23,9 +23,11 @@ pub(crate) struct PyRegistration {
 /// eq. (7) of the method, exactly between the points of the nominal surface.
 ///
 /// Shapes: `measured` is (N, 3), in mm, in the frame of the measuring machine, in any order. `probe_radius` is in mm; 0
-/// means contact points. `side` is "auto", "above" or "below"; `lock` names coordinates that keep their value, such as
-/// "x,y,rz"; `loss` is "none", "huber" or "tukey"; `initial` is a pose (4, 4) at which the search starts; `method` is
-/// "offset", "contact" or "subtract-radius"; `distance` is "curved" or "triangle".
+/// means contact points. `side` is "auto", "above" or "below". `lock` names coordinates of the motion that stay 0, such as
+/// "x,y,rz" or ["x", "y"]: shifts along and rotations about the axes of the model frame, from `initial`, or from the
+/// identity if that is not given. `loss` is "none", "huber" or "tukey"; `initial` is a pose (4, 4) at which the search
+/// starts; `method` is "offset", "contact" or "subtract-radius"; `distance` is "curved" or "triangle". Points beyond
+/// `outlier_sigmas` robust standard deviations do not move the pose; `max_rms` in mm refuses a worse fit.
 ///
 /// Raises DataError for arguments that cannot be used, and RegistrationError with the reason if the points cannot be
 /// registered.
@@ -38,7 +40,7 @@ pub(crate) struct PyRegistration {
 /// >>> found.pose[:3, 3].round(5)
 /// array([3., 2., 1.])
 #[pyfunction]
-#[pyo3(signature = (nominal, measured, *, probe_radius, side: "Literal['auto', 'above', 'below']" = "auto", lock = "",
+#[pyo3(signature = (nominal, measured, *, probe_radius, side: "Literal['auto', 'above', 'below']" = "auto", lock: "str | list[str] | None" = None,
     loss: "Literal['none', 'huber', 'tukey']" = "none", initial = None,
     method: "Literal['offset', 'contact', 'subtract-radius']" = "offset",
     distance: "Literal['curved', 'triangle']" = "curved", outlier_sigmas = 6.0, max_rms = None))]
@@ -49,7 +51,7 @@ pub(crate) fn register(
     measured: ArrayLike,
     probe_radius: f64,
     side: &str,
-    lock: &str,
+    lock: Option<Bound<PyAny>>,
     loss: &str,
     initial: Option<ArrayLike>,
     method: &str,
@@ -58,7 +60,8 @@ pub(crate) fn register(
     max_rms: Option<f64>,
 ) -> PyResult<PyRegistration> {
     let measured = points(&measured.0, "measured")?;
-    let locked = locked(lock)?;
+    let method = choice("method", method, &METHODS)?;
+    let locked = lock.map_or(Ok(Vec::new()), |names| locked(&names))?;
     let start = match initial {
         Some(rows) => Start::Pose(pose(&rows.0)?),
         None if locked.is_empty() => Start::Search,
@@ -71,7 +74,7 @@ pub(crate) fn register(
         )));
     }
     let options = RegistrationOptions {
-        method: if probe_radius == 0.0 { Method::Contact } else { choice("method", method, &METHODS)? },
+        method: if probe_radius == 0.0 { Method::Contact } else { method },
         distance_model: choice("distance", distance, &DISTANCES)?,
         loss: choice("loss", loss, &LOSSES)?,
         side: choice("side", side, &SIDES)?,
@@ -117,9 +120,14 @@ pub(crate) fn choice<T: Copy>(name: &str, given: &str, of: &[(&str, T)]) -> PyRe
     })
 }
 
-fn locked(names: &str) -> PyResult<Vec<Coordinate>> {
-    let names = names.split(',').map(str::trim).filter(|name| !name.is_empty());
-    names.map(|name| choice("lock", name, &COORDINATES)).collect()
+fn locked(names: &Bound<PyAny>) -> PyResult<Vec<Coordinate>> {
+    let listed = match names.extract::<String>() {
+        Ok(text) => text.split(',').map(|name| name.trim().to_owned()).filter(|name| !name.is_empty()).collect(),
+        Err(_) => names.extract::<Vec<String>>().map_err(|_| {
+            DataError::new_err(format!("lock is {names}; it must be names such as \"x,y\" or [\"x\", \"y\"]"))
+        })?,
+    };
+    listed.iter().map(|name| choice("lock", name, &COORDINATES)).collect()
 }
 
 fn pose(given: &Bound<PyAny>) -> PyResult<Pose> {
@@ -135,6 +143,16 @@ fn pose(given: &Bound<PyAny>) -> PyResult<Pose> {
 
 #[pymethods]
 impl PyRegistration {
+    /// Returns the same object: it never changes.
+    fn __copy__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    /// Returns the same object: it never changes.
+    fn __deepcopy__(slf: Py<Self>, _memo: &Bound<PyAny>) -> Py<Self> {
+        slf
+    }
+
     /// Pose that maps coordinates of the model to coordinates of the measuring machine, (4, 4), in mm: g of the method.
     #[getter]
     fn pose<'py>(&self, py: Python<'py>) -> Output2<'py> {

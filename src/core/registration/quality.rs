@@ -110,7 +110,7 @@ pub(crate) fn assess_quality(
         rms_mm: (objective_mm2 / n as f64).sqrt(),
         pv_mm: high_mm - low_mm,
         residual_sigma_mm: residual2.sqrt(),
-        covariance: to_twist * scaled * to_twist.transpose(),
+        covariance: without_locked(to_twist * scaled * to_twist.transpose(), &problem.locked),
         condition: rank.checked_sub(1).map_or(1.0, |last| (spectrum.squares[0] / spectrum.squares[last]).sqrt()),
         weak_directions,
         coverage: 0.0,
@@ -182,6 +182,15 @@ fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64
         ));
     }
     warnings
+}
+
+/// Returns the covariance with 0 in the rows and columns of the locked coordinates, where rounding leaves more.
+fn without_locked(mut covariance: Matrix6<f64>, locked: &[bool; 6]) -> Matrix6<f64> {
+    for k in (0..6).filter(|k| locked[*k]) {
+        covariance.row_mut(k).fill(0.0);
+        covariance.column_mut(k).fill(0.0);
+    }
+    covariance
 }
 
 /// Returns the covariance of the pose, `variance` (A^T A)^-1, in scaled coordinates (translation in units of the rms

@@ -42,5 +42,5 @@ def test_other_numbers_of_samples_are_refused(form, count):
 @pytest.mark.parametrize("number", [-1.0, float("nan"), float("inf")])
 def test_impossible_uncertainties_are_refused(nominal, centres, key, number):
     found = regrind.register(nominal, centres, probe_radius=PROBE_RADIUS)
-    with pytest.raises(regrind.ModelError):
+    with pytest.raises(regrind.DataError, match=key):
         regrind.model(found, **{key: number})

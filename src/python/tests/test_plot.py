@@ -49,7 +49,7 @@ def test_values_in_tolerance_have_a_tint_only(bent):
     assert inside.min() > 0.85 and outside.min() < 0.8
 
 
-@pytest.mark.parametrize(("value", "up"), [(0.0, 1e-6), (0.001, 0.001), (0.0011, 0.002), (3.0, 5.0), (7.0, 10.0), (1e-9, 1e-9)])
+@pytest.mark.parametrize(("value", "up"), [(0.0, 1e-9), (0.001, 0.001), (0.0011, 0.002), (3.0, 5.0), (7.0, 10.0), (1e-9, 1e-9)])
 def test_scales_end_at_round_numbers(value, up):
     assert plot.rounded_up(value) == pytest.approx(up)
 

@@ -1,10 +1,13 @@
 """The program: a part in simulation, its record, and refusals. Left out where the program is not installed."""
 
+import json
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 import regrind
+from conftest import PROBE_RADIUS, turned
 from regrind import _program
 
 RECIPE = Path(__file__).parent / "dome.toml"
@@ -35,6 +38,26 @@ def test_simulated_part_has_a_sound_record(program, tmp_path):
     recipe.write_text(recipe.read_text(encoding="utf-8") + "# changed\n", encoding="utf-8")
     told = regrind.verify(run.folder)
     assert not told.sound and "recipe.toml" in told.reason
+
+
+@pytest.mark.parametrize("method", ["offset", "contact", "subtract-radius"])
+def test_command_line_gives_the_same_bits(program, tmp_path, nominal, centres, method):
+    measured, _ = turned(centres, 0.3, (10.0, -20.0, 5.0))
+    regrind.write(tmp_path / "nominal.csv", nominal.points)
+    regrind.write(tmp_path / "measured.csv", measured)
+    files = ["--nominal", "nominal.csv", "--measured", "measured.csv", "--out", "out", "--max-rms", "10"]
+    command = [program, "register", *files, "--probe-radius", str(PROBE_RADIUS), "--method", method]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    told = json.loads((tmp_path / "out/registration.json").read_text(encoding="utf-8"))
+    rows = np.loadtxt(tmp_path / "out/deviations.csv", delimiter=",", skiprows=1)
+    again = regrind.Nominal.from_file(tmp_path / "nominal.csv")
+    found = regrind.register(
+        again, regrind.read(tmp_path / "measured.csv"), probe_radius=PROBE_RADIUS, method=method, max_rms=10.0
+    )
+    assert (found.pose == np.array(told["cmm_from_model"])).all()
+    assert (found.covariance == np.array(told["covariance"])).all()
+    assert (found.deviations == rows[:, 6]).all() and (found.points == rows[:, :3]).all()
+    assert (found.used == (rows[:, 7] == 1)).all() and found.rms == told["rms_mm"]
 
 
 @pytest.mark.parametrize("seed", [-1, 2**64, 1.5, "1", True])

@@ -3,6 +3,8 @@
 Lengths are in millimetres and angles in radians. Every refusal is a :class:`RegrindError` that says where and why.
 """
 
+import importlib
+
 from ._errors import DataError, ModelError, ProgramError, RegistrationError, RegrindError
 from ._program import Cycle, Run, Verification, simulate, verify
 from ._regrind import (
@@ -27,6 +29,15 @@ from ._regrind import (
     write,
     zernike_fit,
 )
+
+
+
+def __getattr__(name: str) -> object:
+    """Imports ``regrind.plot`` and ``regrind.benchmark`` when they are first used."""
+    if name in ("plot", "benchmark"):
+        return importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
 
 __all__ = [
     "Correction",

@@ -6,6 +6,7 @@ the interpreter, and Ctrl-C stops it.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -62,7 +63,7 @@ class Verification:
 
     #: True if every record, every file and the end are as they were written.
     sound: bool
-    #: True if the run has ended.
+    #: True if the record is sound and the run has ended.
     closed: bool
     #: Number of records, and how many of them are under a signature. 0 if the record is broken.
     records: int
@@ -80,14 +81,15 @@ def simulate(recipe: StrPath, seed: int | None = None, *, runs: StrPath = "runs"
     Raises DataError for a recipe with problems, and ProgramError if the run ends with a fault.
     """
     given = [] if seed is None else ["--seed", str(_whole("seed", seed))]
-    status, lines, errors = _call(["run", os.fspath(recipe), "--runs", os.fspath(runs), *given, "--json"])
+    options = ["--runs", _path("runs", runs), *given, "--json"]
+    status, lines, errors = _call(["run", *options, "--", _path("recipe", recipe)])
     if status == 2:
         raise DataError(errors)
     notices = [json.loads(line) for line in lines.splitlines()]
     folders = [Path(notice["folder"]) for notice in notices if notice["notice"] == "record"]
     if status not in (0, 1) or not folders:
         raise ProgramError(errors or f"regrind run ended with the exit code {status}")
-    return _read_run(folders[0])
+    return _read_run(folders[0].resolve())
 
 
 def _read_run(folder: Path) -> Run:
@@ -105,14 +107,17 @@ def _read_run(folder: Path) -> Run:
     return Run(folder, accepted, ending["ending"], ending.get("reason", ""), cycles)
 
 
-def verify(run: StrPath) -> Verification:
-    """Verifies the record of a run: each record, their order, the end, and each file by its hash.
+def verify(run: StrPath | Run) -> Verification:
+    """Verifies the record of a run, or of its folder: each record, their order, the end, and each file by its hash.
 
     Raises DataError if there is no record in this folder.
     """
-    status, text, errors = _call(["audit", "verify", os.fspath(run), "--json"])
+    folder = _path("run", run.folder if isinstance(run, Run) else run)
+    status, text, errors = _call(["audit", "verify", "--json", "--", folder])
+    if status == 4:
+        raise DataError(errors or f"{folder}: the run is still under way; verify it when it has ended")
     if status not in (0, 1) or not text.strip():
-        raise DataError(errors or f"{os.fspath(run)}: regrind audit verify ended with the exit code {status}")
+        raise DataError(errors or f"{folder}: regrind audit verify ended with the exit code {status}")
     told = json.loads(text)
     sound = bool(told["sound"]) and status == 0
     reason = "" if sound else str(told.get("what", errors))
@@ -125,10 +130,18 @@ def _whole(name: str, value: int) -> int:
     return value.__index__()
 
 
+def _path(name: str, path: StrPath) -> str:
+    try:
+        text = os.fsdecode(path)
+    except TypeError:
+        raise DataError(f"{name} is {path!r}; it must be a path") from None
+    if not text or "\0" in text:
+        raise DataError(f"{name} is {text!r}; it must be a path without NUL characters")
+    return text
+
+
 def _call(arguments: Sequence[str]) -> tuple[int, str, str]:
     """Calls the program; returns its exit code, its output and its error messages."""
-    if any("\0" in argument for argument in arguments):
-        raise DataError("a path has a NUL character; remove it")
     command = [str(_program()), *arguments]
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, encoding="utf-8", errors="replace"
@@ -138,6 +151,8 @@ def _call(arguments: Sequence[str]) -> tuple[int, str, str]:
         except BaseException:
             # Ctrl-C has reached the program too, which brings its machines to their safe places.
             process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(60)
             raise
     return process.returncode, output, errors.strip()
 

@@ -2,12 +2,11 @@
 Exact registration of measured probe centres to the offset of a nominal surface, with uncertainty.
 """
 
-from _typeshed import SupportsLenAndGetItem
 from numpy import bool_, float64, uint32
 from numpy.typing import ArrayLike, NDArray
 from collections.abc import Callable
 from os import PathLike
-from typing import Literal, Final, SupportsFloat, SupportsIndex, final
+from typing import Literal, Any, Final, SupportsFloat, SupportsIndex, final
 
 __all__ = ["__version__", "Correction", "ErrorMap", "Form", "Interval", "Iso10110", "Nominal", "PolynomialFit", "Registration", "ToolPath", "compensate", "error_map", "gaussian", "iso10110", "model", "read", "register", "toolpath", "write", "zernike_fit"]
 
@@ -21,6 +20,14 @@ class Correction:
     """
     Correction of a pass: by how much the surface is to be higher than the nominal surface plus the level.
     """
+    def __copy__(self, /) -> Correction:
+        """
+        Returns the same object: it never changes.
+        """
+    def __deepcopy__(self, /, _memo: Any) -> Correction:
+        """
+        Returns the same object: it never changes.
+        """
     def __repr__(self, /) -> str: ...
     @property
     def cycle(self, /) -> int:
@@ -64,6 +71,14 @@ class ErrorMap:
     """
     Map of the error on a grid, filtered by a Gaussian filter of ISO 16610-61.
     """
+    def __copy__(self, /) -> ErrorMap:
+        """
+        Returns the same object: it never changes.
+        """
+    def __deepcopy__(self, /, _memo: Any) -> ErrorMap:
+        """
+        Returns the same object: it never changes.
+        """
     def __repr__(self, /) -> str: ...
     @property
     def advice(self, /) -> list[str]:
@@ -83,7 +98,7 @@ class ErrorMap:
     @property
     def uncertainty(self, /) -> NDArray[float64]:
         """
-        Standard uncertainty of the error at each node from the noise of the points in mm, (N, M).
+        Standard uncertainty of the error at each node from the noise of the points in mm, (N, M); NaN where the error is.
         """
     @property
     def values(self, /) -> NDArray[float64]:
@@ -104,8 +119,16 @@ class ErrorMap:
 @final
 class Form:
     """
-    Form of a part with its figures and their uncertainty.
+    Form of a part after its own best fit, with its figures and their uncertainty.
     """
+    def __copy__(self, /) -> Form:
+        """
+        Returns the same object: it never changes.
+        """
+    def __deepcopy__(self, /, _memo: Any) -> Form:
+        """
+        Returns the same object: it never changes.
+        """
     def __repr__(self, /) -> str: ...
     @property
     def frame_covariance(self, /) -> NDArray[float64]:
@@ -121,6 +144,11 @@ class Form:
     def noise_sigma(self, /) -> float:
         """
         Standard deviation of the noise of a single point, in mm.
+        """
+    @property
+    def places(self, /) -> NDArray[float64]:
+        """
+        Places of these points over x and y of the model frame in mm, (M, 2).
         """
     @property
     def pv(self, /) -> Interval:
@@ -142,7 +170,7 @@ class Form:
         Samples of the form from its posterior at the same points in mm, (`count`, M). Each row is a form that the
         points allow. The same `count` gives the same samples; 1000 are those from which the figures come.
 
-        Raises DataError for 0 samples, and for more than 1e8 values.
+        Raises DataError for 0 samples, and for more than 2e7 values.
         """
     @property
     def uncertainty(self, /) -> NDArray[float64]:
@@ -160,6 +188,14 @@ class Interval:
     """
     Median and 95 % interval of a figure, in mm.
     """
+    def __copy__(self, /) -> Interval:
+        """
+        Returns the same object: it never changes.
+        """
+    def __deepcopy__(self, /, _memo: Any) -> Interval:
+        """
+        Returns the same object: it never changes.
+        """
     def __repr__(self, /) -> str: ...
     @property
     def high(self, /) -> float:
@@ -182,6 +218,14 @@ class Iso10110:
     """
     Power, irregularity and symmetric part by ISO 10110-5, in nanometres.
     """
+    def __copy__(self, /) -> Iso10110:
+        """
+        Returns the same object: it never changes.
+        """
+    def __deepcopy__(self, /, _memo: Any) -> Iso10110:
+        """
+        Returns the same object: it never changes.
+        """
     def __repr__(self, /) -> str: ...
     @property
     def irregularity_nm(self, /) -> float:
@@ -214,6 +258,14 @@ class Nominal:
     """
     Nominal surface: the ideal shape of a part.
     """
+    def __copy__(self, /) -> Nominal:
+        """
+        Returns the same object: it never changes.
+        """
+    def __deepcopy__(self, /, _memo: Any) -> Nominal:
+        """
+        Returns the same object: it never changes.
+        """
     def __len__(self, /) -> int: ...
     def __repr__(self, /) -> str: ...
     @staticmethod
@@ -302,6 +354,14 @@ class PolynomialFit:
     """
     Fit of polynomials to deviations.
     """
+    def __copy__(self, /) -> PolynomialFit:
+        """
+        Returns the same object: it never changes.
+        """
+    def __deepcopy__(self, /, _memo: Any) -> PolynomialFit:
+        """
+        Returns the same object: it never changes.
+        """
     def __repr__(self, /) -> str: ...
     @property
     def coefficients(self, /) -> NDArray[float64]:
@@ -329,6 +389,14 @@ class Registration:
     """
     Result of a registration.
     """
+    def __copy__(self, /) -> Registration:
+        """
+        Returns the same object: it never changes.
+        """
+    def __deepcopy__(self, /, _memo: Any) -> Registration:
+        """
+        Returns the same object: it never changes.
+        """
     def __len__(self, /) -> int: ...
     def __repr__(self, /) -> str: ...
     @property
@@ -424,6 +492,14 @@ class ToolPath:
     """
     Path of the centre of a wheel over a part.
     """
+    def __copy__(self, /) -> ToolPath:
+        """
+        Returns the same object: it never changes.
+        """
+    def __deepcopy__(self, /, _memo: Any) -> ToolPath:
+        """
+        Returns the same object: it never changes.
+        """
     def __len__(self, /) -> int: ...
     def __repr__(self, /) -> str: ...
     @property
@@ -456,12 +532,12 @@ class ToolPath:
         Raises DataError for a path of more than 5e7 points.
         """
 
-def compensate(error_map: ErrorMap, *, depth_of_cut: SupportsFloat | SupportsIndex, max_correction: SupportsFloat | SupportsIndex, removal_budget: SupportsFloat | SupportsIndex, previous: Correction | None = None, allowance: SupportsFloat | SupportsIndex = 0.0, gain: SupportsFloat | SupportsIndex = 1.0, min_depth: SupportsFloat | SupportsIndex = 0.0005, max_depth: SupportsFloat | SupportsIndex | None = None) -> Correction:
+def compensate(error_map: ErrorMap, *, depth_of_cut: SupportsFloat | SupportsIndex, max_correction: SupportsFloat | SupportsIndex, removal_budget: SupportsFloat | SupportsIndex, previous: Correction | None = None, allowance: SupportsFloat | SupportsIndex | None = None, gain: SupportsFloat | SupportsIndex = 1.0, min_depth: SupportsFloat | SupportsIndex = 0.0005, max_depth: SupportsFloat | SupportsIndex | None = None) -> Correction:
     """
     Correction of the next pass: the last correction minus `gain` times the measured error, within limits.
 
     A pass can only remove material, so the next pass is deeper by `depth_of_cut` in mm, or by more where the correction
-    rises. `previous` is the correction of the pass that was measured; without it, that pass had none, and its level was
+    rises. `previous` is the correction of the pass that was measured; without it, that pass was the first, had none, and left
     `allowance` in mm. `max_correction` limits the correction at any place, `removal_budget` the removal below the first
     pass, `max_depth` the depth of the pass at any place, and `min_depth` is the least depth of cut at any place; all in
     mm.
@@ -492,14 +568,14 @@ def error_map(places: ArrayLike, deviations: ArrayLike, *, cutoff: SupportsFloat
     [-1.0, -0.8, -0.6, -0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
     """
 
-def gaussian(values: ArrayLike, *, spacing: SupportsLenAndGetItem[SupportsFloat | SupportsIndex], cutoff: SupportsFloat | SupportsIndex, order: Literal[0, 1, 2] = 1, robust: bool = False) -> NDArray[float64]:
+def gaussian(values: ArrayLike, *, spacing: ArrayLike, cutoff: SupportsFloat | SupportsIndex, order: Literal[0, 1, 2] = 1, robust: bool = False) -> NDArray[float64]:
     """
     Filters a map of heights by the areal Gaussian filter of ISO 16610-61.
 
-    Shapes: `values` is (N, M); NaN marks nodes without a value. `spacing` is the distance of the nodes along x and y, and
+    Shapes: `values` is (N, M); NaN marks nodes without a value. `spacing` is the distance of the nodes along x and y, or one number for both, and
     `cutoff` the wavelength at which half of the amplitude passes, in mm. `order` is that of the polynomial that passes
     unchanged: 0, 1 or 2. `robust` selects the robust filter of ISO 16610-71. The result is (N, M); nodes with too few
-    values around them are NaN.
+    values around them are NaN. A node without a value gets that of the filter if enough nodes around it have one.
 
     Raises DataError for arguments that cannot be used.
 
@@ -508,13 +584,13 @@ def gaussian(values: ArrayLike, *, spacing: SupportsLenAndGetItem[SupportsFloat 
     0.0
     """
 
-def iso10110(places: ArrayLike, deviations: ArrayLike, *, radius: SupportsFloat | SupportsIndex | None = None, centre: SupportsLenAndGetItem[SupportsFloat | SupportsIndex] = ..., wavelength: SupportsFloat | SupportsIndex = 632.8e-6) -> Iso10110:
+def iso10110(places: ArrayLike, deviations: ArrayLike, *, radius: SupportsFloat | SupportsIndex | None = None, centre: ArrayLike | None = None, wavelength: SupportsFloat | SupportsIndex = 632.8e-6) -> Iso10110:
     """
     Figures of ISO 10110-5 of deviations, without piston and tilt.
 
     Shapes: `places` is (N, 2) or (N, 3), of which x and y are used, in mm; `deviations` is (N,), in mm. `radius` is that of
-    a round part about `centre`, in mm; without it, the centre is that of the bounds of the points. `wavelength` is in mm
-    and only appears in the notation.
+    a round part about `centre`, by default the origin, in mm; without it, the centre is that of the bounds of the points.
+    `wavelength` is in mm and only appears in the notation.
 
     Raises DataError if the points do not determine the figures.
 
@@ -531,7 +607,9 @@ def model(registration: Registration, *, radius_uncertainty: SupportsFloat | Sup
     `radius_uncertainty` is the standard uncertainty of the radius of the probe in mm, and `length_uncertainty` the
     relative standard uncertainty of all lengths. No point can show them, so both are 0 unless they are stated.
 
-    Raises ModelError with the reason if the deviations give no model.
+    The form is that after its best fit: the motion of the part that is closest to it does not count.
+
+    Raises DataError for an uncertainty beyond its limit, and ModelError with the reason if the deviations give no model.
 
     >>> x = np.linspace(-20, 20, 81)
     >>> saddle = lambda x, y: 4e-3 * x**2 - 3e-3 * y**2 + 1e-4 * x**3 + 8e-5 * x * y**2
@@ -550,7 +628,7 @@ def read(path: str | PathLike[str]) -> NDArray[float64]:
     Raises DataError with the path, the place and the reason.
     """
 
-def register(nominal: Nominal, measured: ArrayLike, *, probe_radius: SupportsFloat | SupportsIndex, side: Literal['auto', 'above', 'below'] = "auto", lock: str = "", loss: Literal['none', 'huber', 'tukey'] = "none", initial: ArrayLike | None = None, method: Literal['offset', 'contact', 'subtract-radius'] = "offset", distance: Literal['curved', 'triangle'] = "curved", outlier_sigmas: SupportsFloat | SupportsIndex = 6.0, max_rms: SupportsFloat | SupportsIndex | None = None) -> Registration:
+def register(nominal: Nominal, measured: ArrayLike, *, probe_radius: SupportsFloat | SupportsIndex, side: Literal['auto', 'above', 'below'] = "auto", lock: str | list[str] | None = None, loss: Literal['none', 'huber', 'tukey'] = "none", initial: ArrayLike | None = None, method: Literal['offset', 'contact', 'subtract-radius'] = "offset", distance: Literal['curved', 'triangle'] = "curved", outlier_sigmas: SupportsFloat | SupportsIndex = 6.0, max_rms: SupportsFloat | SupportsIndex | None = None) -> Registration:
     """
     Registers measured points to the offset of a nominal surface, without an initial guess.
 
@@ -558,9 +636,11 @@ def register(nominal: Nominal, measured: ArrayLike, *, probe_radius: SupportsFlo
     eq. (7) of the method, exactly between the points of the nominal surface.
 
     Shapes: `measured` is (N, 3), in mm, in the frame of the measuring machine, in any order. `probe_radius` is in mm; 0
-    means contact points. `side` is "auto", "above" or "below"; `lock` names coordinates that keep their value, such as
-    "x,y,rz"; `loss` is "none", "huber" or "tukey"; `initial` is a pose (4, 4) at which the search starts; `method` is
-    "offset", "contact" or "subtract-radius"; `distance` is "curved" or "triangle".
+    means contact points. `side` is "auto", "above" or "below". `lock` names coordinates of the motion that stay 0, such as
+    "x,y,rz" or ["x", "y"]: shifts along and rotations about the axes of the model frame, from `initial`, or from the
+    identity if that is not given. `loss` is "none", "huber" or "tukey"; `initial` is a pose (4, 4) at which the search
+    starts; `method` is "offset", "contact" or "subtract-radius"; `distance` is "curved" or "triangle". Points beyond
+    `outlier_sigmas` robust standard deviations do not move the pose; `max_rms` in mm refuses a worse fit.
 
     Raises DataError for arguments that cannot be used, and RegistrationError with the reason if the points cannot be
     registered.
@@ -579,10 +659,12 @@ def toolpath(nominal: Nominal, correction: Correction | None = None, *, wheel_ra
     Path of the wheel over the nominal surface plus a correction.
 
     The wheel is a ball of `wheel_radius`, or with `rim_radius` a disc with a round rim whose spindle is along y; both in
-    mm. `track` is the distance of the tracks in mm, or `scallop` is the greatest height in mm of the ridges between them.
+    mm. `track` is the distance of the tracks in mm, or `scallop` is the height h in mm of the ridges between them, to first
+    order: h = track² / (8 r), with 1/r the curvature of the wheel less that of the surface.
     `feed` is in mm/min. `pattern` is "raster" or "spiral". `side` is the side from which the wheel comes: "above" or
     "below". `chord_error` is the greatest distance of the lines between the points from the path in mm. `overrun` is the
-    length of the tracks beyond the edge, and `safe_height` the height of rapid moves above the path, both in mm.
+    length of the tracks beyond the edge, before which and after which the wheel comes down and lifts off along 2 mm more at
+    feed; `safe_height` is the height of rapid moves above the path; both in mm.
 
     Raises DataError if the wheel does not fit the surface: the text says where, by how much, and what to do.
 
@@ -608,11 +690,11 @@ def write(path: str | PathLike[str], what: ArrayLike | Registration | ErrorMap |
     Raises DataError with the path and the reason; a file of that name is then unchanged.
     """
 
-def zernike_fit(places: ArrayLike, deviations: ArrayLike, *, radius: SupportsFloat | SupportsIndex, centre: SupportsLenAndGetItem[SupportsFloat | SupportsIndex] = ..., terms: SupportsIndex = 36) -> PolynomialFit:
+def zernike_fit(places: ArrayLike, deviations: ArrayLike, *, radius: SupportsFloat | SupportsIndex, centre: ArrayLike | None = None, terms: SupportsIndex = 36) -> PolynomialFit:
     """
     Fits Fringe Zernike polynomials to deviations by least squares at the places of the points.
 
-    Shapes: `places` is (N, 2) or (N, 3), in mm; `deviations` is (N,), in mm. `radius` and `centre` are those of the disc, in
+    Shapes: `places` is (N, 2) or (N, 3), in mm; `deviations` is (N,), in mm. `radius` and `centre` are those of the disc, by default about the origin, in
     mm. `terms` is the number of polynomials, 1 to 37.
 
     Raises DataError if the points do not determine the polynomials.

@@ -52,7 +52,10 @@ def show(
         raise DataError("what has no value to draw")
     band_um = None if tolerance is None else 1e3 * _above_zero("tolerance", tolerance)
     end_um = 1e3 * (rounded_up(float(np.abs(values).max())) if limit is None else _above_zero("limit", limit))
-    end_um = max(end_um, 1.25 * (band_um or 0.0))
+    least_um = 1.25 * (band_um or 0.0)
+    if limit is not None and end_um < least_um:
+        raise DataError(f"limit is {limit}; it must be 1.25 times tolerance at least, {1e-3 * least_um}")
+    end_um = max(end_um, least_um)
     axes = _axes(ax)
     style: dict[str, Any] = {"cmap": _colour_map(band_um, end_um), "vmin": -end_um, "vmax": end_um}
     drawn: Any
@@ -83,7 +86,7 @@ def show(
 
 def histogram(deviations: ArrayLike, *, ax: Axes | None = None, bins: int = 60) -> Axes:
     """Draws how often each deviation occurs, in µm, with the mean and the root mean square. Returns the axes."""
-    values = 1e3 * np.asarray(deviations, dtype=float).ravel()
+    values = 1e3 * np.ma.filled(np.ma.asarray(deviations, dtype=float), np.nan).ravel()
     values = values[np.isfinite(values)]
     if values.size == 0:
         raise DataError("deviations has no finite number")
@@ -95,9 +98,9 @@ def histogram(deviations: ArrayLike, *, ax: Axes | None = None, bins: int = 60) 
 
 
 def rounded_up(value: float) -> float:
-    """Next number of the series 1, 2, 5, 10 ... that is not below ``value``; 1e-6 for 0."""
-    if value <= 0.0:
-        return 1e-6
+    """Next number of the series 1, 2, 5, 10 ... that is not below ``value``; 1e-9 mm at least."""
+    if value <= 1e-9:
+        return 1e-9
     decade = 10.0 ** np.floor(np.log10(value))
     return float(next(step * decade for step in (1.0, 2.0, 5.0, 10.0, 20.0) if step * decade >= value * (1 - 1e-9)))
 

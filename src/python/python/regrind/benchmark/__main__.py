@@ -173,6 +173,13 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all figures to this file")
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
+    if given.json and not given.json.absolute().parent.is_dir():
+        parser.error(f"--json {given.json}: there is no such folder")
+    if given.mirror and not list(given.mirror.glob("*_surface.txt")):
+        parser.error(f"--mirror {given.mirror}: there is no file *_surface.txt")
+    for word in given.contender:
+        if not any(word in contender.label for contender in CONTENDERS):
+            parser.error(f"--contender {word}: none of {', '.join(contender.label for contender in CONTENDERS)}")
     if given.child:
         in_this_process(given.child, given.contender[0])
         return
