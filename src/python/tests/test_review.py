@@ -127,7 +127,7 @@ def test_interrupted_simulation_leaves_no_program(tmp_path):
         pytest.skip(str(refused))
     recipe = tmp_path / "slow.toml"
     text = (Path(__file__).parent / "dome.toml").read_text(encoding="utf-8")
-    recipe.write_text(text.replace("seed = 1", "seed = 1\nspeed = 20.0"), encoding="utf-8")
+    recipe.write_text(text.replace("speed = 10000.0", "speed = 20.0"), encoding="utf-8")
     code = "import regrind, sys\ntry:\n    regrind.simulate(sys.argv[1], runs=sys.argv[2])\nexcept KeyboardInterrupt:\n    print('stopped')"
     runs = tmp_path / "runs"
     child = subprocess.Popen([sys.executable, "-c", code, str(recipe), str(runs)], stdout=subprocess.PIPE, text=True)
