@@ -128,7 +128,8 @@ def test_interrupted_simulation_leaves_no_program(tmp_path):
     recipe = tmp_path / "slow.toml"
     text = (Path(__file__).parent / "dome.toml").read_text(encoding="utf-8")
     recipe.write_text(text.replace("speed = 10000.0", "speed = 20.0"), encoding="utf-8")
-    code = "import regrind, sys\ntry:\n    regrind.simulate(sys.argv[1], runs=sys.argv[2])\nexcept KeyboardInterrupt:\n    print('stopped')"
+    # A shell gives SIGINT ignored to what it runs in the background.
+    code = "import regrind, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\ntry:\n    regrind.simulate(sys.argv[1], runs=sys.argv[2])\nexcept KeyboardInterrupt:\n    print('stopped')"
     runs = tmp_path / "runs"
     child = subprocess.Popen([sys.executable, "-c", code, str(recipe), str(runs)], stdout=subprocess.PIPE, text=True)
     while not list(runs.glob("*/journal.anchor")):
