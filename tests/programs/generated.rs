@@ -469,7 +469,7 @@ fn assert_is_corrected(drawn: &RandomProgram, text: &str, error: fn(f64, f64) ->
 #[test]
 fn drawn_program_corrected_or_refused() {
     let (mut corrected, mut refused, mut kept) = (0, 0, 0);
-    let count = seeds(30);
+    let count = seeds(60);
     for seed in 0..count {
         let drawn = drawn(seed);
         let error: fn(f64, f64) -> f64 = if seed % 4 == 0 { |_, _| 0.004 } else { error_mm };

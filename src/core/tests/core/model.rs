@@ -23,7 +23,7 @@ const NOISE_MM: f64 = 3e-4;
 
 /// Returns the number of parts that each test of intervals draws.
 fn parts() -> u64 {
-    seeds(4)
+    seeds(8)
 }
 
 /// Returns the number of parts whose intervals of 95 % may miss by chance, scaled from the number for sixteen parts.
@@ -187,7 +187,7 @@ fn many_points_bound_polynomial_corners() {
         all_mm += pv_mm;
         held += u64::from(contains(pv, pv_mm));
     }
-    assert!(held + allowed_misses(2).max(1) >= parts(), "{held} of {}", parts());
+    assert!(held + allowed_misses(2) >= parts(), "{held} of {}", parts());
     // By cosines alone, which are level at the edge, it would be a twentieth.
     assert!(width_mm < 0.033 * all_mm, "{width_mm} {all_mm}");
 }
@@ -258,7 +258,7 @@ fn measured_by_machine(seed: u64, machine: &MachineUncertainty, radius_sigma_mm:
 
 #[test]
 fn machine_uncertainty_widens_form() {
-    let machines = seeds(4);
+    let machines = seeds(8);
     let machine = MachineUncertainty { scale: [2e-5; 3], squareness_rad: [2e-5; 3], ..MachineUncertainty::default() };
     let radius_sigma_mm = 3e-4;
     let given = ModelInputs { machine, radius_sigma_mm, ..ModelInputs::default() };
@@ -308,7 +308,7 @@ fn held_with_offset(seed: u64, datum: [f64; 6]) -> (FormError, Registration) {
 
 #[test]
 fn fixture_uncertainty_widens_form() {
-    let drawn = seeds(3);
+    let drawn = seeds(5);
     let datum = [5e-3, 5e-3, 0.0, 0.0, 0.0, 1e-4];
     let given = ModelInputs { locked_sigmas: Some(datum), ..ModelInputs::default() };
     let (mut with, mut without, mut wider) = ([0; 2], [0; 2], 0.0);

@@ -1,4 +1,4 @@
-"""What an independent tester found: each was wrong once."""
+"""Edges of the package: budgets over several passes, masked arrays, locks, other coordinates, interrupts, odd arguments."""
 
 import copy
 import signal
