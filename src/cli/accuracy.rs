@@ -6,6 +6,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::formats::NominalFile;
+use regrind::setup;
 use regrind::surface::accuracy::{
     Accuracy, ErrorEstimate, ErrorFigures, NominalPoints, Reliability, estimate_accuracy,
 };
@@ -13,6 +14,7 @@ use regrind::surface::{Nominal, PlaneProjection};
 use serde::Serialize;
 
 use super::choice::word_of;
+use super::face_list::{FaceLine, face_lines, listed};
 use super::failure::Failure;
 use super::nominal::{self, NominalTable};
 use super::words::{counted, three_digits};
@@ -31,7 +33,7 @@ Example:
 Exit codes: 0 the error PV in the line `curved` is at most --want, or --want is not given; 1 this error exceeds --want;
 2 bad arguments or data; 3 fault.")]
 pub(super) struct Arguments {
-    /// Nominal surface: points as text or PLY, a mesh as STL or PLY, or a TOML definition, in mm
+    /// Nominal surface: points as text or PLY, a mesh as STL or PLY, a CAD model as STEP or IGES, or a TOML definition
     #[arg(long, value_name = "FILE")]
     nominal: PathBuf,
     #[command(flatten)]
@@ -49,6 +51,9 @@ pub(super) struct Arguments {
 
 #[derive(Serialize)]
 struct Document {
+    /// Faces of a CAD model, in the order of the file.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    faces: Vec<FaceLine>,
     points: usize,
     spacing_mm: f64,
     wanted_pv_nm: Option<f64>,
@@ -76,8 +81,9 @@ struct Kind {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let found = judge(arguments)?;
+    let (found, faces) = judge(arguments)?;
     let document = Document {
+        faces,
         points: found.points,
         spacing_mm: found.spacing_mm,
         wanted_pv_nm: arguments.want,
@@ -96,24 +102,35 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(if reached { Outcome::Accepted } else { Outcome::NotInTolerance })
 }
 
-fn judge(arguments: &Arguments) -> Result<Accuracy, Failure> {
-    let path = &arguments.nominal;
-    let projection = arguments.projection;
-    match nominal::read(path, arguments.projection, &arguments.table.table())? {
-        NominalFile::Points(points) => estimate_accuracy(NominalPoints::Points { points: &points, projection }),
-        NominalFile::Mesh { points, triangles } => {
-            // Every command reports a bad mesh with the same message.
-            Nominal::from_mesh(points.clone(), triangles)
-                .and_then(|mesh| mesh.check_is_open())
-                .and_then(|()| estimate_accuracy(NominalPoints::Points { points: &points, projection }))
-        }
-        NominalFile::Definition(text) => {
-            let grid = nominal::sampled(path, &text)?;
-            let (columns, rows) = (grid.columns, grid.rows);
-            estimate_accuracy(NominalPoints::Grid { columns, rows, points: &grid.points, normals: &grid.normals })
-        }
+/// Returns the estimate, and the faces of a CAD model.
+fn judge(arguments: &Arguments) -> Result<(Accuracy, Vec<FaceLine>), Failure> {
+    let (path, projection) = (&arguments.nominal, arguments.projection);
+    let file = nominal::read(path, projection, &arguments.table.table())?;
+    let selection = arguments.table.selection();
+    let faces = if let NominalFile::Faces(model) = &file { face_lines(model, &selection) } else { Vec::new() };
+    let defined = setup::defined_from_file(path, &file, &selection);
+    // The faces are what a person needs to choose another one.
+    if defined.is_err() && !arguments.json {
+        super::print(&listed(&faces))?;
     }
-    .map_err(|source| Failure::Nominal { path: path.clone(), source })
+    let estimate = if let Some(surface) = defined.map_err(Failure::Setup)? {
+        let grid = nominal::sampled(path, &surface)?;
+        let (columns, rows) = (grid.columns, grid.rows);
+        estimate_accuracy(NominalPoints::Grid { columns, rows, points: &grid.points, normals: &grid.normals })
+    } else {
+        match file {
+            NominalFile::Points(points) => estimate_accuracy(NominalPoints::Points { points: &points, projection }),
+            NominalFile::Mesh { points, triangles } => {
+                // Every command reports a bad mesh with the same message.
+                Nominal::from_mesh(points.clone(), triangles)
+                    .and_then(|mesh| mesh.check_is_open())
+                    .and_then(|()| estimate_accuracy(NominalPoints::Points { points: &points, projection }))
+            }
+            NominalFile::Definition(_) | NominalFile::Faces(_) => unreachable!("they define a surface"),
+        }
+    };
+    let estimate = estimate.map_err(|source| Failure::Nominal { path: path.clone(), source })?;
+    Ok((estimate, faces))
 }
 
 impl Kind {
@@ -149,12 +166,15 @@ impl Kind {
 }
 
 fn summary(document: &Document, arguments: &Arguments) -> String {
-    let mut text = format!(
-        "nominal     {}: {}, spacing {} mm\n",
+    let mut text = listed(&document.faces);
+    writeln!(
+        text,
+        "nominal     {}: {}, spacing {} mm",
         arguments.nominal.display(),
         counted(document.points, "point"),
         three_digits(document.spacing_mm)
-    );
+    )
+    .expect("text grows");
     for (name, kind) in [("curved", &document.curved), ("triangle", &document.triangle)] {
         describe(&mut text, name, kind, arguments.want).expect("text grows");
     }

@@ -12,7 +12,7 @@ use data_encoding::HEXLOWER;
 use regrind::config::{CellConfig, DialectFile, read_dialect};
 use regrind::document::{Problem, Problems};
 use regrind::recipe::{MeasuringPattern, NominalSource, Recipe};
-use regrind::setup::{nominal_table_format, plan_table_format, read_nominal};
+use regrind::setup::{defined_from_file, nominal_table_format, plan_table_format, read_nominal};
 use regrind::surface::PlaneProjection;
 use serde::Serialize;
 
@@ -176,14 +176,17 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
             Some(problems) => problems.problems.extend(more.problems),
         }
     };
-    if let NominalSource::File { path, table, .. } = &recipe.nominal {
+    if let NominalSource::File { path, table, selection, .. } = &recipe.nominal {
         match nominal_table_format(table) {
             Err((key, what)) => add(key, &what),
-            Ok(table) => {
-                if let Err(failure) = nominal::read(path, PlaneProjection::Auto, &table) {
-                    add("nominal.file", &failure);
+            Ok(table) => match nominal::read(path, PlaneProjection::Auto, &table) {
+                Err(failure) => add("nominal.file", &failure),
+                Ok(file) => {
+                    if let Err(failure) = defined_from_file(path, &file, selection) {
+                        add("nominal.file", &failure);
+                    }
                 }
-            }
+            },
         }
     }
     if let MeasuringPattern::File { path, table } = &recipe.pattern {

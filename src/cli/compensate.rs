@@ -8,7 +8,7 @@ use regrind::compensation::path::{TargetSurface, correction_spline, nominal_heig
 use regrind::formats::gcode::{
     AlongNormals, Amended, Amendment, GcodeError, MapKind, correct_program, read_program_map,
 };
-use regrind::formats::{Table, is_same_file};
+use regrind::formats::is_same_file;
 use regrind::geometry::Grid;
 use regrind::surface::PlaneProjection;
 use serde::Serialize;
@@ -117,7 +117,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         &Correction { grid: map.nodes.grid, values_mm, cycle: 1, level_mm: 0.0, parameters: None },
         level_off_mm,
     );
-    let ground = arguments.nominal.as_ref().map(|file| ground(file, &arguments.table.table())).transpose()?;
+    let ground = arguments.nominal.as_ref().map(|file| ground(file, &arguments.table)).transpose()?;
     let amendment = Amendment {
         shift: &shift,
         along_normals: ground.as_ref().map(|nominal| AlongNormals { nominal, centre_above_mm: tip_mm }),
@@ -169,10 +169,10 @@ fn summary(amended: &Amended) -> String {
 const LEVEL_OFF_NODES: f64 = 5.0;
 
 /// Reads the nominal surface in `file` and returns it as a target surface without a correction. `table` is the format
-/// of the file if the file is a table of points.
+/// of the file if the file is a table of points, and the face of a CAD model.
 ///
 /// Returns an error if the file cannot be read, or if the surface cannot be written as a height z = f(x, y).
-fn ground(file: &std::path::Path, table: &Table) -> Result<TargetSurface, Failure> {
+fn ground(file: &std::path::Path, table: &NominalTable) -> Result<TargetSurface, Failure> {
     let surface = nominal::surface(file, PlaneProjection::Auto, table)?;
     let failed = |source| Failure::Path { path: file.to_owned(), source };
     let (field, _) = nominal_height_field(&surface).map_err(failed)?;

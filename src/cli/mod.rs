@@ -9,6 +9,7 @@ mod compensate;
 mod completeness;
 mod control;
 mod doctor;
+mod face_list;
 mod failure;
 mod file_kind;
 mod init;

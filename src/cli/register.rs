@@ -27,7 +27,7 @@ use super::{Outcome, above_zero, finite_above_zero, finite_from_zero};
 #[command(after_long_help = LONG_HELP, after_help = "Example:\n  regrind register --nominal lens.csv --measured cmm.csv \
 --probe-radius 1.5 --out registered\n\n--help shows more than -h.")]
 pub(super) struct Arguments {
-    /// Nominal surface: points as text or PLY, a mesh as STL or PLY, or a TOML definition, in mm
+    /// Nominal surface: points as text or PLY, a mesh as STL or PLY, a CAD model as STEP or IGES, or a TOML definition
     #[arg(long, value_name = "FILE")]
     nominal: PathBuf,
     /// Measured points as text or PLY, in mm, or an interferometer's or profilometer's map as X3P, SDF or MetroPro
@@ -179,11 +179,10 @@ fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure>
     if is_map(&arguments.measured)? && method(arguments) != Method::Contact {
         return Err(Failure::MapOfContacts { path: arguments.measured.clone() });
     }
-    let of_nominal = arguments.of_nominal.table();
     let of_measured =
         Table { columns: arguments.columns.clone(), unit: arguments.unit, height_unit: arguments.height_unit };
     std::thread::scope(|scope| {
-        let nominal = scope.spawn(|| nominal::surface(path, projection, &of_nominal));
+        let nominal = scope.spawn(|| nominal::surface(path, projection, &arguments.of_nominal));
         let measured = read_measured_with_notes(&arguments.measured, &of_measured);
         let nominal = nominal.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
         Ok((nominal, measured?))

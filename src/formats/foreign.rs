@@ -18,7 +18,7 @@ const EXPECTED: &str = "points as text or PLY, a mesh, or a map as X3P, SDF or M
 
 const AS_TEXT: &str = "save the sheet with the points as CSV";
 const UNPACK: &str = "unpack it and give the file that is in it";
-const SAMPLE: &str = "sample the surface as points in the CAD system, or export a mesh as STL or PLY";
+const SAMPLE: &str = "give it as the nominal surface, or export points as text";
 const DEFINE: &str = "write the equation of the surface into a definition (TOML), or export points as text";
 const MAP: &str = "export the map as X3P, or as SDF of version 1.0";
 

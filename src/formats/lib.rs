@@ -3,6 +3,8 @@
 //! No file is trusted. A [`FormatError`] reports any fault of a file. It names the file and the place, gives the text
 //! found and the text expected, and says what to do. Nothing here panics. The size of the file bounds time and memory.
 
+mod cad;
+mod choice_error;
 mod columns;
 mod dmis;
 mod document;
@@ -20,6 +22,7 @@ mod learned;
 mod map;
 mod measured_map;
 pub mod metropro;
+mod nominal_file;
 mod note;
 mod number;
 pub mod operator_step;
@@ -43,6 +46,8 @@ mod xml;
 
 use std::path::Path;
 
+pub use cad::{CadFace, CadModel, parse_cad, read_cad};
+pub use choice_error::ChoiceError;
 pub use columns::{Columns, Table};
 pub use document::{
     Alternative, MeasuredInput, NominalInput, ProgramVersion, RegistrationDocument, StandardUncertainty,
@@ -60,6 +65,7 @@ pub use map::{
 };
 pub use measured_map::is_map;
 pub use metropro::{parse_metropro, read_metropro};
+pub use nominal_file::{NominalFile, read_nominal, read_nominal_as, read_nominal_with_identity};
 pub use note::{NotedPoints, PointNote};
 pub use number::LIMIT_MM;
 pub use persistent_counter::PersistentCounter;
@@ -78,113 +84,20 @@ pub use whole::read_whole;
 pub use x3p::{MapRecord, X3pFile, escaped, parse_x3p, read_x3p, write_error_map_x3p, write_x3p};
 pub use xml::is_bounded_xml;
 
+use cad::cad_format;
 use height_map::MapFormat;
 use layout::is_separator_line;
 use measured_map::map_format;
 use regrind_core::geometry::Point;
 
-/// Largest surface definition that is read, in bytes.
-const MAX_DEFINITION_BYTES: u64 = 1 << 20;
-
-/// Nominal surface in one of the forms that a file can have.
-#[derive(Clone, Debug, PartialEq)]
-pub enum NominalFile {
-    /// Points on the surface, in millimetres, in the order of the file.
-    Points(Vec<Point>),
-    /// A triangle mesh.
-    Mesh {
-        /// The vertices in millimetres.
-        points: Vec<Point>,
-        /// Corner indices.
-        triangles: Vec<[u32; 3]>,
-    },
-    /// The text of a TOML file that defines the surface by its equation; another module parses it.
-    Definition(String),
-}
-
+/// Format of a file, detected by its content.
 enum Kind {
     Text,
     Ply,
     Stl,
     Toml,
+    Cad,
     Map(&'static MapFormat),
-}
-
-/// Reads a nominal surface from a file, and returns it with its SHA-256. `table` gives the columns and units that a
-/// table of points does not state. The hash is computed from the bytes of the file and from the columns and units in
-/// `table`, because another choice of columns gives another surface.
-///
-/// # Errors
-/// The same as for [`read_nominal_as`].
-pub fn read_nominal_with_identity(
-    path: impl AsRef<Path>,
-    table: &Table,
-) -> Result<(NominalFile, [u8; 32]), FormatError> {
-    use sha2::Digest;
-    let path = path.as_ref();
-    let nominal = read_nominal_as(path, table)?;
-    let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
-    let mut hash = sha2::Sha256::new();
-    let mut file = std::fs::File::open(path).map_err(unreadable)?;
-    let mut chunk = vec![0; 1 << 16];
-    loop {
-        match std::io::Read::read(&mut file, &mut chunk).map_err(unreadable)? {
-            0 => {
-                let columns = table.columns.as_ref().map(ToString::to_string);
-                let unit = table.unit.map(|unit| unit.to_string());
-                let height_unit = table.height_unit.map(|unit| format!("height {unit}"));
-                for said in [columns, unit, height_unit].into_iter().flatten() {
-                    hash.update(said);
-                }
-                return Ok((nominal, hash.finalize().into()));
-            }
-            n => hash.update(&chunk[..n]),
-        }
-    }
-}
-
-/// Reads a nominal surface from a file: points (text, PLY), a mesh (PLY, STL), or the text of a TOML definition. Points
-/// and vertices are in millimetres.
-///
-/// The content decides the format. The extension decides only if the content is ambiguous.
-///
-/// # Errors
-/// A file that cannot be read, or that is not valid in its format; a measured map; a format that this program does not
-/// read.
-pub fn read_nominal(path: impl AsRef<Path>) -> Result<NominalFile, FormatError> {
-    read_nominal_as(path, &Table::default())
-}
-
-/// Reads a nominal surface from a file: points, a mesh or the text of a TOML definition, as [`read_nominal`] does. If
-/// the file is a table of points, `table` gives the columns and units that the file does not state.
-///
-/// # Errors
-/// The same as for [`read_nominal`]; columns that do not exist; columns or a unit in `table` for a file that is not a
-/// table.
-pub fn read_nominal_as(path: impl AsRef<Path>, table: &Table) -> Result<NominalFile, FormatError> {
-    let path = path.as_ref();
-    let kind = kind(path)?;
-    check_is_table(path, &kind, table)?;
-    Ok(match kind {
-        Kind::Text => NominalFile::Points(read_nominal_points(path, table)?),
-        Kind::Toml => NominalFile::Definition(read_definition(path)?),
-        Kind::Stl => {
-            let StlFile { points, triangles, .. } = read_stl(path)?;
-            NominalFile::Mesh { points, triangles }
-        }
-        Kind::Ply => {
-            let PlyFile { points, triangles, .. } = read_ply(path)?;
-            if triangles.is_empty() { NominalFile::Points(points) } else { NominalFile::Mesh { points, triangles } }
-        }
-        Kind::Map(_) => {
-            return Err(FormatError::WrongKind {
-                path: path.to_owned(),
-                expected: "a nominal surface as points, mesh or definition",
-                found: "a measured map of heights",
-                remedy: "give the map as the measurement",
-            });
-        }
-    })
 }
 
 /// Reads measured points, in millimetres and in the order of the file. The file is text, PLY (its vertices are the
@@ -220,6 +133,7 @@ pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result
         Kind::Ply => read_ply(path).map(|file| file.points.into()),
         Kind::Stl => wrong("an STL mesh", "export the points, or give the mesh as the nominal"),
         Kind::Toml => wrong("a TOML file", "give the definition as the nominal"),
+        Kind::Cad => wrong("a CAD model", "give the model as the nominal"),
         Kind::Map(format) => format.read_points(path).map(|map| map.points.into()),
     }
 }
@@ -260,6 +174,9 @@ fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatE
 fn kind(path: &Path) -> Result<Kind, FormatError> {
     let opened = whole::open(path)?;
     let (head, length) = (&opened.head[..], opened.length);
+    if cad_format(head).is_some() {
+        return Ok(Kind::Cad);
+    }
     foreign::check_is_ours(path, head)?;
     if ply::is_ply(head) {
         return Ok(Kind::Ply);
@@ -305,17 +222,4 @@ fn is_toml(head: &[u8]) -> bool {
         && table.is_some_and(|name| !name.is_empty() && name.iter().all(|b| is_key(b) || b"[\"' ".contains(b)));
     let is_quoted = |key: &[u8]| key.starts_with(b"\"") && key.len() > 1 && key.ends_with(b"\"");
     opens_table || key.is_some_and(|key| !key.is_empty() && (key.iter().all(is_key) || is_quoted(key)))
-}
-
-fn read_definition(path: &Path) -> Result<String, FormatError> {
-    let bytes = whole::open(path)?.read_all(path, MAX_DEFINITION_BYTES)?;
-    if bytes.trim_ascii().is_empty() {
-        return Err(FormatError::Empty { path: path.to_owned(), expected: "a surface definition" });
-    }
-    String::from_utf8(bytes).map_err(|error| {
-        let at = error.utf8_error().valid_up_to();
-        let bytes = error.as_bytes();
-        let line = 1 + bytes[..at].iter().filter(|&&b| b == b'\n').count() as u64;
-        FormatError::NotText { path: path.to_owned(), line, value: bytes[at] }
-    })
 }

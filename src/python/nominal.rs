@@ -5,12 +5,20 @@ use std::sync::OnceLock;
 
 use pyo3::prelude::*;
 use regrind_core::geometry::Point;
-use regrind_core::surface::{DefinedSurface, Nominal, NominalKind, PlaneProjection};
+use regrind_core::surface::parametric::FaceFrame;
+use regrind_core::surface::{DefinedSurface, Nominal, NominalKind, PlaneProjection, SurfaceChoice, SurfaceSelection};
 use regrind_formats::{NominalFile, Table, read_nominal_with_identity};
 use sha2::{Digest, Sha256};
 
 use super::arrays::{ArrayLike, Output2, points, rows, vectors};
 use super::errors::{DataError, data};
+
+/// Number or name of a face.
+#[derive(FromPyObject)]
+enum FaceKey {
+    Number(usize),
+    Name(String),
+}
 
 /// Nominal surface: the ideal shape of a part.
 #[pyclass(name = "Nominal", module = "regrind", frozen)]
@@ -160,15 +168,45 @@ impl PyNominal {
         py.detach(|| defined(text)).map(|nominal| Self::new(nominal, Some(identity)))
     }
 
-    /// Surface in a file: points as text or PLY, a mesh as STL or PLY, or a TOML definition.
+    /// Surface in a file: points as text or PLY, a mesh as STL or PLY, a CAD model as STEP or IGES, or a TOML definition.
+    ///
+    /// `face` chooses a face of a CAD model by its number from 1 or by its name; without it, it is the largest.
+    /// `face_frame` is "file", or "face" for a frame in the middle of the face with z along its outward normal.
     ///
     /// Raises DataError with the path, the place and the reason.
     #[staticmethod]
-    #[pyo3(signature = (path, projection: "Literal['auto', 'xy', 'best-fit', 'spherical']" = "auto"))]
-    fn from_file(py: Python, path: PathBuf, projection: &str) -> PyResult<Self> {
+    #[pyo3(signature = (
+        path,
+        projection: "Literal['auto', 'xy', 'best-fit', 'spherical']" = "auto",
+        *,
+        face: "int | str | None" = None,
+        face_frame: "Literal['file', 'face']" = "file",
+    ))]
+    fn from_file(
+        py: Python,
+        path: PathBuf,
+        projection: &str,
+        face: Option<FaceKey>,
+        face_frame: &str,
+    ) -> PyResult<Self> {
         let projection = plane(projection)?;
+        let frame = match face_frame {
+            "file" => FaceFrame::File,
+            "face" => FaceFrame::Face,
+            other => {
+                return Err(DataError::new_err(format!("face_frame is {other:?}; it must be \"file\" or \"face\"")));
+            }
+        };
+        let choice = face.map(|face| match face {
+            FaceKey::Number(number) => SurfaceChoice::Number(number),
+            FaceKey::Name(name) => SurfaceChoice::Name(name),
+        });
+        let selection = SurfaceSelection { choice, frame, ..SurfaceSelection::default() };
         py.detach(|| {
-            let (read, identity) = read_nominal_with_identity(&path, &Table::default()).map_err(data)?;
+            let (read, identity) = read_nominal_with_identity(&path, &Table::default(), &selection).map_err(data)?;
+            if let Some(surface) = read.defined_surface(&selection).map_err(data)? {
+                return sampled(&surface).map(|nominal| Self::new(nominal, Some(identity)));
+            }
             let nominal = match read {
                 NominalFile::Points(points) => Nominal::from_points(points, projection).map_err(data)?,
                 NominalFile::Mesh { points, triangles } => {
@@ -176,7 +214,7 @@ impl PyNominal {
                     nominal.check_is_open().map_err(data)?;
                     nominal
                 }
-                NominalFile::Definition(text) => defined(&text)?,
+                NominalFile::Definition(_) | NominalFile::Faces(_) => unreachable!("they define a surface"),
             };
             Ok(Self::new(nominal, Some(identity)))
         })
@@ -250,7 +288,10 @@ fn check_corners(points: &[Point], triangles: &[[u32; 3]]) -> PyResult<()> {
 }
 
 fn defined(text: &str) -> PyResult<Nominal> {
-    let surface = DefinedSurface::from_toml(text).map_err(data)?;
+    sampled(&DefinedSurface::from_toml(text).map_err(data)?)
+}
+
+fn sampled(surface: &DefinedSurface) -> PyResult<Nominal> {
     let grid = surface.spacing_mm().and_then(|spacing_mm| surface.sample(spacing_mm)).map_err(data)?;
     let nominal = Nominal::from_grid_with_normals(grid.columns, grid.rows, grid.points, grid.normals).map_err(data)?;
     Ok(nominal.with_outline(surface.aperture().clone()))

@@ -6,8 +6,8 @@ use serde::Deserialize;
 
 use super::curvature;
 use super::tables::{
-    Acceptance, Compensation, Grinding, MeasurementSettings, Micrometres, NominalTable, PatternKind, RecipeFile,
-    RegistrationSettings, RegistrationStart, SelectionMode, TiltKind, WheelDimensions,
+    Acceptance, Compensation, FaceKey, Grinding, MeasurementSettings, Micrometres, NominalTable, PatternKind,
+    RecipeFile, RegistrationSettings, RegistrationStart, SelectionMode, TiltKind, WheelDimensions,
 };
 use super::{MeasuringPattern, NominalSource, TableSettings};
 use crate::cell::FirstStep;
@@ -16,7 +16,8 @@ use crate::document::Document;
 use crate::geometry::Aperture;
 use crate::measuring::Layout;
 use crate::registration::{Coordinate, ProbeSide};
-use crate::surface::{DefinedSurface, SurfaceDefinition};
+use crate::surface::analytic::{Sampling, SamplingDefinition};
+use crate::surface::{DefinedSurface, SurfaceChoice, SurfaceDefinition, SurfaceSelection};
 
 /// Maximum number of points: more than any part is measured with.
 const MAX_POINTS: f64 = 1e6;
@@ -60,24 +61,32 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
             ("columns", written.columns.is_some()),
             ("unit", written.unit.is_some()),
             ("height_unit", written.height_unit.is_some()),
+            ("face", written.face.is_some()),
+            ("face_frame", written.face_frame.is_some()),
         ];
         for (key, _) in of_points.into_iter().filter(|(_, there)| *there) {
-            document.report(&format!("nominal.{key}"), "is only for a file of points", "", "remove this key");
+            document.report(&format!("nominal.{key}"), "is only for `nominal.file`", "", "remove this key");
         }
         return formula(written, document);
     };
-    for (key, there) in [("surface", written.surface.is_some()), ("sampling", written.sampling.is_some())] {
-        if there {
-            let key = format!("nominal.{key}");
-            document.report(
-                &key,
-                "is given together with `nominal.file`",
-                "the nominal surface comes from a file or from a formula, not from both",
-                from_formula,
-            );
-        }
+    if written.surface.is_some() {
+        document.report(
+            "nominal.surface",
+            "is given together with `nominal.file`",
+            "the nominal surface comes from a file or from a formula, not from both",
+            from_formula,
+        );
     }
-    let aperture = written.aperture.clone().and_then(|table| aperture(table, document));
+    let selection = SurfaceSelection {
+        choice: written.face.as_ref().map(|face| match face {
+            FaceKey::Number(number) => SurfaceChoice::Number(*number as usize),
+            FaceKey::Name(name) if name == "largest" => SurfaceChoice::Largest,
+            FaceKey::Name(name) => SurfaceChoice::Name(name.clone()),
+        }),
+        frame: written.face_frame.unwrap_or_default(),
+        aperture: written.aperture.clone().and_then(|table| aperture(table, document)),
+        sampling: written.sampling.clone().and_then(|table| sampling(table, document)),
+    };
     Some(NominalSource::File {
         path: resolve_path(folder, file),
         table: TableSettings {
@@ -86,7 +95,7 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
             height_unit: written.height_unit.clone(),
         },
         projection: written.projection.unwrap_or_default(),
-        aperture,
+        selection,
     })
 }
 
@@ -99,6 +108,18 @@ fn aperture(table: toml::Table, document: &mut Document) -> Option<Aperture> {
                 let key = format!("nominal.aperture.{}", error.key());
                 document.report(&key, without_key(error.key(), &error.to_string()), "", "");
             }
+        },
+    }
+    None
+}
+
+/// Parses the table `[nominal.sampling]` of a face.
+fn sampling(table: toml::Table, document: &mut Document) -> Option<Sampling> {
+    match toml::Value::Table(table).try_into::<SamplingDefinition>() {
+        Err(error) => document.report("nominal.sampling", error.message().trim(), "", "correct the sampling"),
+        Ok(sampling) => match sampling.resolve() {
+            Ok(sampling) => return Some(sampling),
+            Err(error) => document.report("nominal.sampling", error.to_string(), "", ""),
         },
     }
     None
@@ -537,7 +558,7 @@ fn check_tables(written: &RecipeFile, document: &mut Document) {
 fn check_against_part(written: &RecipeFile, nominal: Option<&NominalSource>, document: &mut Document) {
     let (surface, aperture) = match nominal {
         Some(NominalSource::Surface(surface)) => (Some(surface.as_ref()), Some(surface.aperture())),
-        Some(NominalSource::File { aperture, .. }) => (None, aperture.as_ref()),
+        Some(NominalSource::File { selection, .. }) => (None, selection.aperture.as_ref()),
         None => return,
     };
     if let Some(aperture) = aperture {

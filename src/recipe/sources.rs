@@ -2,9 +2,8 @@
 
 use std::path::PathBuf;
 
-use crate::geometry::Aperture;
 use crate::measuring::Layout;
-use crate::surface::{DefinedSurface, PlaneProjection};
+use crate::surface::{DefinedSurface, PlaneProjection, SurfaceSelection};
 
 /// Format of a table of points, as text from the recipe, for files that do not state their format themselves.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -28,8 +27,8 @@ pub enum NominalSource {
         table: TableSettings,
         /// Surface onto which scattered points are projected.
         projection: PlaneProjection,
-        /// Outline of the part, if it is smaller than the points.
-        aperture: Option<Aperture>,
+        /// Face of a CAD model and its frame, and the outline of the part, if it is smaller than the surface.
+        selection: SurfaceSelection,
     },
     /// Formula.
     Surface(Box<DefinedSurface>),

@@ -13,6 +13,7 @@ use crate::compensation::{FilterOrder, GainRule, Smoothing, SplineSmoothness};
 use crate::geometry::Aperture;
 use crate::registration::{Coordinate, Loss, ProbeSide};
 use crate::surface::analytic::{Formula, SamplingDefinition};
+use crate::surface::parametric::FaceFrame;
 use crate::surface::{DistanceModel, PlaneProjection};
 
 /// A length in micrometres, as recipes have it.
@@ -87,7 +88,7 @@ pub struct Part {
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct NominalTable {
-    /// File of points (CSV, XYZ, PLY), of a mesh (STL, PLY) or of a surface definition (TOML), in mm.
+    /// File of points (CSV, XYZ, PLY), of a mesh (STL, PLY), of faces (STEP, IGES) or of a surface definition (TOML).
     #[schemars(length(min = 1, max = 400), example = "mirror.csv")]
     pub file: Option<String>,
     /// Columns of x, y and z in a table of points, if its header does not identify them: `x=NAME,y=NAME,z=NAME`, names
@@ -100,6 +101,10 @@ pub(super) struct NominalTable {
     /// Unit of length of z in a table of points, if it differs from that of x and y.
     #[schemars(length(min = 1, max = 12), example = &"um")]
     pub height_unit: Option<String>,
+    /// Face of a CAD model: its number from 1, its name, or `largest`, the default. `regrind accuracy` lists the faces.
+    pub face: Option<FaceKey>,
+    /// Frame of a face: that of the file, or one in the middle of the face with z along its outward normal.
+    pub face_frame: Option<FaceFrame>,
     /// Projection of scattered points of a file for the triangulation.
     pub projection: Option<PlaneProjection>,
     /// A formula z(x, y).
@@ -108,9 +113,19 @@ pub(super) struct NominalTable {
     /// The outline of the part in x, y.
     #[schemars(with = "Option<Aperture>")]
     pub aperture: Option<toml::Table>,
-    /// Sampling of a formula: one of the two keys.
+    /// Sampling of a formula or of a face: one of the two keys.
     #[schemars(with = "Option<SamplingDefinition>")]
     pub sampling: Option<toml::Table>,
+}
+
+/// Number or name of a face.
+#[derive(Clone, Debug, Deserialize, JsonSchema, PartialEq)]
+#[serde(untagged)]
+pub(super) enum FaceKey {
+    /// Number from 1.
+    Number(u32),
+    /// Name in the file, or `largest`.
+    Name(String),
 }
 
 /// Pattern of the targets.

@@ -6,8 +6,8 @@ use thiserror::Error;
 
 use crate::compensation::path::PathError;
 use crate::device::DriverError;
-use crate::formats::FormatError;
 use crate::formats::gcode::DialectError;
+use crate::formats::{ChoiceError, FormatError};
 use crate::measuring::PatternError;
 use crate::surface::{DefinitionError, SurfaceError};
 
@@ -20,6 +20,8 @@ pub enum SetupError {
     File(#[from] FormatError),
     #[error("{path}: {source}")]
     Nominal { path: PathBuf, source: SurfaceError },
+    #[error("{path}: {source}")]
+    Choice { path: PathBuf, source: ChoiceError },
     #[error("{path}: {source}")]
     Definition { path: PathBuf, source: DefinitionError },
     #[error("{}: {key}: {what}; correct the value of this key", .path.display())]

@@ -30,7 +30,7 @@ use grinding::{pass, programs, surface_and_outline, track_distance};
 use learning::{learning_kind, learning_setting};
 use measurement::{adaptive, expansion, lay_targets, min_found_share, probing, reference_sphere};
 use nominal::nominal_with_identity;
-pub use nominal::{nominal_from_file, nominal_table_format, plan_table_format, read_nominal};
+pub use nominal::{defined_from_file, nominal_from_file, nominal_table_format, plan_table_format, read_nominal};
 
 /// Size of one target in the registers of a plan, in bytes. A point of a result is smaller.
 const MAX_TARGET_BYTES: usize = 56;

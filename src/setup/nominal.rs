@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 
 use super::error::SetupError;
-use crate::formats::{self, NominalFile};
+use crate::formats::{self, ChoiceError, NominalFile};
 use crate::recipe::{NominalSource, Recipe, TableSettings};
-use crate::surface::{DefinedSurface, Nominal, PlaneProjection};
+use crate::surface::{DefinedSurface, Nominal, PlaneProjection, SurfaceSelection};
 
 /// Reads the nominal surface that `recipe` names from a file, or samples it from the formula in `recipe`.
 ///
@@ -26,18 +26,14 @@ pub(super) fn nominal_with_identity(recipe: &Recipe) -> Result<(Nominal, PathBuf
             let identity = surface_identity(&nominal);
             Ok((nominal, recipe.path().to_owned(), identity))
         }
-        NominalSource::File { path, table, projection, aperture } => {
+        NominalSource::File { path, table, projection, selection } => {
             let table = nominal_table_format(table).map_err(|(key, what)| SetupError::Table {
                 path: recipe.path().to_owned(),
                 key,
                 what,
             })?;
-            let (file, identity) = formats::read_nominal_with_identity(path, &table)?;
-            let nominal = nominal_from_file(path, file, *projection)?;
-            let nominal = match aperture {
-                Some(outline) => nominal.with_outline(outline.clone()),
-                None => nominal,
-            };
+            let (file, identity) = formats::read_nominal_with_identity(path, &table, selection)?;
+            let nominal = nominal_from_file(path, file, *projection, selection)?;
             Ok((nominal, path.clone(), identity))
         }
     }
@@ -70,25 +66,56 @@ fn table_format(words: &TableSettings, keys: [&'static str; 3]) -> Result<format
     })
 }
 
-/// Builds the nominal surface from `file`, the content of the file at `path`. The content is points, a mesh or the
-/// definition of a surface by a formula. `projection` is used for points only: it selects the surface onto which the
-/// points are projected for their triangulation.
+/// Builds the nominal surface from `file`, the content of the file at `path`. The content is points, a mesh, faces of a
+/// CAD model, or the definition of a surface by a formula. `projection` is used for points only: it selects the surface
+/// onto which the points are projected for their triangulation. `selection` selects a face, and gives the outline.
 ///
 /// # Errors
-/// Returns an error with `path` if no surface can be built from the content, or if a mesh encloses a solid.
-pub fn nominal_from_file(path: &Path, file: NominalFile, projection: PlaneProjection) -> Result<Nominal, SetupError> {
+/// Returns an error with `path` if no surface can be built from the content, if a mesh encloses a solid, or if the
+/// selection does not fit the content.
+pub fn nominal_from_file(
+    path: &Path,
+    file: NominalFile,
+    projection: PlaneProjection,
+    selection: &SurfaceSelection,
+) -> Result<Nominal, SetupError> {
     let of_surface = |source| SetupError::Nominal { path: path.to_owned(), source };
-    match file {
-        NominalFile::Points(points) => Nominal::from_points(points, projection).map_err(of_surface),
+    if let Some(surface) = defined_from_file(path, &file, selection)? {
+        let nominal = sample_surface(path, &surface)?;
+        return Ok(with_outline(nominal, selection));
+    }
+    let nominal = match file {
+        NominalFile::Points(points) => Nominal::from_points(points, projection).map_err(of_surface)?,
         NominalFile::Mesh { points, triangles } => {
             let nominal = Nominal::from_mesh(points, triangles).map_err(of_surface)?;
             nominal.check_is_open().map_err(of_surface)?;
-            Ok(nominal)
+            nominal
         }
-        NominalFile::Definition(text) => match DefinedSurface::from_toml(&text) {
-            Ok(surface) => sample_surface(path, &surface),
-            Err(source) => Err(SetupError::Definition { path: path.to_owned(), source }),
-        },
+        NominalFile::Definition(_) | NominalFile::Faces(_) => unreachable!("they define a surface"),
+    };
+    Ok(with_outline(nominal, selection))
+}
+
+/// Returns the surface of a definition or of a face in `file`, the content of the file at `path`. Returns `None` for
+/// points and meshes.
+///
+/// # Errors
+/// Returns an error with `path` if the selection does not fit the file, or if the surface is not valid.
+pub fn defined_from_file(
+    path: &Path,
+    file: &NominalFile,
+    selection: &SurfaceSelection,
+) -> Result<Option<DefinedSurface>, SetupError> {
+    file.defined_surface(selection).map_err(|source| match source {
+        ChoiceError::Definition(source) => SetupError::Definition { path: path.to_owned(), source },
+        source => SetupError::Choice { path: path.to_owned(), source },
+    })
+}
+
+fn with_outline(nominal: Nominal, selection: &SurfaceSelection) -> Nominal {
+    match &selection.aperture {
+        Some(outline) => nominal.with_outline(outline.clone()),
+        None => nominal,
     }
 }
 

@@ -12,6 +12,8 @@ from pathlib import Path
 
 # From this seed on schedules are by other wires than Modbus.
 OTHER_WIRES = 1_000_000
+# Schedules that take longer hang: 2,000 take some 500 s on two cores.
+MAX_SECONDS = 3600
 
 GUARDS = {
     "START waits for its record": (
@@ -160,7 +162,10 @@ def tried(root, tree, target, change, kind, most):
         environment = {"REGRIND_SCHEDULES": str(seeds), "PATH": "/usr/bin:/bin"}
         other = "ippdme" in file or "linuxcnc" in file
         run = ["--exact", kind or ("schedules_on_other_wires" if other else "schedules_keep_promises")]
-        done = subprocess.run([tree / program, *run], cwd=tree, env=environment, capture_output=True, text=True)
+        try:
+            done = subprocess.run([tree / program, *run], cwd=tree, env=environment, capture_output=True, text=True, timeout=MAX_SECONDS)
+        except subprocess.TimeoutExpired:
+            return seeds, f"one of them did not end within {MAX_SECONDS} s"
         broken = re.findall(r"^seed (\d+): (.*)$", done.stdout + done.stderr, re.M)
         if broken:
             seed, what = min(broken, key=lambda found: int(found[0]))

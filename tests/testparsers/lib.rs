@@ -21,13 +21,15 @@ use regrind::formats::gcode::{
 };
 use regrind::formats::result::{Content, Coordinates, DecimalMark, check_ended, parse_result};
 use regrind::formats::{
-    HeightMap, LIMIT_MM, Learned, X3pFile, parse_metropro, parse_ply, parse_points, parse_sdf, parse_stl, parse_x3p,
-    read_error_map, references::parse_references,
+    HeightMap, LIMIT_MM, Learned, X3pFile, parse_cad, parse_metropro, parse_ply, parse_points, parse_sdf, parse_stl,
+    parse_x3p, read_error_map, references::parse_references,
 };
 use regrind::geometry::{Grid, GridMap, Point};
 use regrind::journal::{Anchor, Reader, RecordKind, canonical_json, verify};
 use regrind::recipe::Recipe;
 use regrind::surface::DefinedSurface;
+use regrind::surface::analytic::Sampling;
+use regrind::surface::parametric::FaceFrame;
 use regrind_sim::payload;
 use regrind_testcell::payloads::{self, Encode};
 use regrind_testutils::root;
@@ -105,6 +107,19 @@ fn assert_heights(map: &HeightMap) {
     assert!(map.pv_mm() >= 0.0 && map.rms_mm() >= 0.0);
     assert_eq!(map.points().len(), map.measured_count());
     assert!(map.points().iter().all(|p| p.iter().all(|v| v.is_finite())));
+}
+
+/// Faces in STEP and IGES, the largest as a surface.
+pub fn cad(bytes: &[u8]) -> bool {
+    let Ok(model) = parse_cad(path(), bytes) else { return false };
+    assert!(!model.faces.is_empty());
+    for face in model.faces.iter().take(2).filter_map(|face| face.face.as_ref().ok()) {
+        assert!(face.area_mm2() >= 0.0 || face.area_mm2().is_nan());
+        let Ok(placed) = face.place(FaceFrame::Face, None, Sampling::Spacing { spacing_mm: 1.0 }) else { continue };
+        let found = placed.surface.formula().sag_and_gradient(0.0, 0.0);
+        assert!(found.is_none_or(|(z, gradient)| (z + gradient[0] + gradient[1]).is_finite()));
+    }
+    true
 }
 
 /// Maps in SDF.

@@ -35,8 +35,18 @@ impl From<Point> for TreePoint {
     fn from(p: Point) -> Self {
         /// Limit of the coordinates: squares of larger ones would overflow.
         const MAX_COORDINATE: f64 = 1e100;
-        Self(<[f64; 3]>::from(p).map(|c| NotNan::new(c.clamp(-MAX_COORDINATE, MAX_COORDINATE)).unwrap_or_default()))
+        Self(
+            <[f64; 3]>::from(p)
+                .map(|c| NotNan::new(spread(c.clamp(-MAX_COORDINATE, MAX_COORDINATE))).unwrap_or_default()),
+        )
     }
+}
+
+/// Rounds a coordinate so that two different ones always have a number between them. The tree is cut at the middle of
+/// two coordinates; if this were one of the two, the cut would never end.
+fn spread(c: f64) -> f64 {
+    const MIN_MAGNITUDE: f64 = 1e-200;
+    if c.abs() < MIN_MAGNITUDE { 0.0 } else { f64::from_bits(c.to_bits() & !0b11) }
 }
 
 impl nabo::Point<f64> for TreePoint {
@@ -70,6 +80,16 @@ mod tests {
             exact.sort_by(f64::total_cmp);
             assert_eq!(found.len(), 25);
             assert!(found.iter().zip(exact).all(|((_, square), exact)| (exact - square).abs() < 1e-12));
+        }
+    }
+
+    #[test]
+    fn neighbouring_numbers_are_divided() {
+        for (low, high) in
+            [(1.0f64, 1.0f64.next_up()), (0.0, 5e-324), (-5e-324, 5e-324), (1e-310, 2e-310), (8.0f64.next_down(), 8.0)]
+        {
+            let points = (0..100).map(|i| Point::new(if i % 2 == 0 { low } else { high }, 7.0, 7.0));
+            assert_eq!(PointTree::new(points).nearest(&Point::new(low, 7.0, 7.0), 20).count(), 20);
         }
     }
 

@@ -198,6 +198,20 @@ fn rotation_logarithm(rotation: &Matrix3<f64>) -> Vector {
     if sine < 1e-12 { v * 2.0 } else { v * (2.0 * sine.atan2(w) / sine) }
 }
 
+/// Returns the smallest rotation that maps the z axis to `n`, a vector of length 1. For n = -z it is the half turn about
+/// x.
+pub(crate) fn min_rotation(n: &Vector) -> Matrix3<f64> {
+    let across = n.x * n.x + n.y * n.y;
+    // 1 / (1 + z), without the loss of digits near z = -1.
+    let s = if n.z < 0.0 { (1.0 - n.z) / across } else { 1.0 / (1.0 + n.z) };
+    if n.z < 0.0 && across < 1e-30 {
+        return Matrix3::from_diagonal(&Vector::new(1.0, -1.0, -1.0));
+    }
+    let x = Vector::new(1.0 - n.x * n.x * s, -n.x * n.y * s, -n.x);
+    let y = Vector::new(-n.x * n.y * s, 1.0 - n.y * n.y * s, -n.y);
+    Matrix3::from_columns(&[x, y, *n])
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -273,5 +287,19 @@ mod tests {
         let mut projective = Pose::identity().to_rows();
         projective[3][0] = 0.5;
         assert!(matches!(Pose::from_rows(projective), Err(PoseError::LastRow(_))));
+    }
+
+    #[test]
+    fn min_rotation_is_exact_everywhere() {
+        let near = [1e-3, 1e-7, 1e-12, 0.0].map(|e| Vector::new(e, -0.5 * e, -1.0).normalize());
+        let others = [Vector::z(), Vector::x(), Vector::new(0.3, -0.4, -0.2).normalize()];
+        for n in near.into_iter().chain(others) {
+            let rotation = min_rotation(&n);
+            assert!((rotation * Vector::z() - n).norm() < 1e-15);
+            assert!((rotation * rotation.transpose() - Matrix3::identity()).amax() < 1e-15, "{n}");
+            assert!((rotation.determinant() - 1.0).abs() < 1e-15);
+            // A rotation about an axis in the xy plane.
+            assert!((rotation[(0, 1)] - rotation[(1, 0)]).abs() < 1e-15);
+        }
     }
 }

@@ -5,7 +5,7 @@
 //!  points --+-- regular grid? ----------------> GridTopology   (no triangulation; normals from the grid lines)
 //!           +-- projection -> Delaunay -------> MeshTopology   (flat arrays; a normal is fitted when first needed)
 //!  mesh ----------------------------------------^
-//!  formula -> sampled, exact normals ---------> GridTopology
+//!  formula, CAD face -> sampled, exact normals -> GridTopology
 //!                                                    \
 //!                                                     OffsetSurface: projection, distance, normal of any point
 //! ```
@@ -25,10 +25,12 @@ mod nominal;
 mod nominal_noise;
 mod normals;
 mod offset;
+pub mod parametric;
 mod patch;
 mod plane_projection;
 mod prefetch;
 mod project_x4;
+mod selection;
 pub(crate) mod simd;
 mod triangulation;
 
@@ -43,3 +45,4 @@ pub use offset::{DistanceModel, OffsetSurface, PointProjection};
 pub use plane_projection::PlaneProjection;
 pub(crate) use plane_projection::{is_line, principal_axes};
 pub(crate) use project_x4::ProjectionX4;
+pub use selection::{SurfaceChoice, SurfaceSelection};

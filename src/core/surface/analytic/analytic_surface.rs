@@ -1,5 +1,7 @@
 //! Surface with a formula, which can be a section of a larger surface away from its axis.
 
+use std::sync::Arc;
+
 use nalgebra::Matrix3;
 use serde::{Deserialize, Serialize};
 
@@ -9,7 +11,9 @@ use super::forbes::{Qbfs, Qcon};
 use super::polynomial::XyPolynomial;
 use super::toroid::{Biconic, Toroid};
 use super::zernike::Zernike;
+use crate::geometry::pose::min_rotation;
 use crate::geometry::{Aperture, Point, Vector};
+use crate::surface::parametric::HeightField;
 
 /// Number of steps from the section's centre to a place, if Newton's method does not converge at this place directly.
 const CONTINUATION_STEPS: u32 = 64;
@@ -166,23 +170,7 @@ impl OffAxis {
     }
 }
 
-/// Returns the smallest rotation that maps the z axis to `n`, a unit vector on the +z side.
-fn min_rotation(n: &Vector) -> Matrix3<f64> {
-    let s = 1.0 / (1.0 + n.z);
-    Matrix3::new(
-        1.0 - n.x * n.x * s,
-        -n.x * n.y * s,
-        n.x, //
-        -n.x * n.y * s,
-        1.0 - n.y * n.y * s,
-        n.y, //
-        -n.x,
-        -n.y,
-        n.z,
-    )
-}
-
-/// Surface given by a formula, with checked numbers.
+/// Surface given by a formula, or by a face of a CAD model, with checked numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub enum AnalyticSurface {
     /// A conic of revolution; a sphere and a plane are conics too.
@@ -203,6 +191,8 @@ pub enum AnalyticSurface {
     Qcon(Qcon),
     /// Forbes' polynomials for mild aspheres.
     Qbfs(Qbfs),
+    /// Face of a CAD model, of which the place (u, v) of each (x, y) is found.
+    Face(Arc<HeightField>),
 }
 
 impl AnalyticSurface {
@@ -223,6 +213,7 @@ impl AnalyticSurface {
             Self::Biconic(biconic) => biconic.sag_and_gradient(x, y),
             Self::XyPolynomial(polynomial) => polynomial.sag_and_gradient(x, y),
             Self::Zernike(zernike) => zernike.sag_and_gradient(x, y),
+            Self::Face(field) => field.sag_and_gradient(x, y),
         };
         found.filter(|(z, [gx, gy])| z.is_finite() && gx.is_finite() && gy.is_finite())
     }
@@ -270,6 +261,7 @@ impl AnalyticSurface {
             Self::Toroid(toroid) => toroid.term_count(),
             Self::XyPolynomial(polynomial) => polynomial.term_count(),
             Self::Zernike(zernike) => zernike.term_count(),
+            Self::Face(field) => field.term_count(),
         }
     }
 }

@@ -264,7 +264,7 @@ impl SamplingDefinition {
     ///
     /// # Errors
     /// Returns an error if a value is outside its range, or if none or both of the keys are given.
-    fn resolve(&self) -> Result<Sampling, DefinitionError> {
+    pub fn resolve(&self) -> Result<Sampling, DefinitionError> {
         match (self.spacing_mm, self.accuracy_nm) {
             (Some(spacing), None) => {
                 Ok(Sampling::Spacing { spacing_mm: error::check_positive("spacing_mm", spacing)? })

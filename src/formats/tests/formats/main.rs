@@ -1,5 +1,6 @@
 //! Files in and out: points, meshes and maps.
 
+mod cad;
 mod headers;
 mod map_files;
 mod points;

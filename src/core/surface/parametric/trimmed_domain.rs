@@ -1,0 +1,217 @@
+//! The part of a (u, v) domain that outlines in space enclose.
+
+use super::parametric_surface::{ParametricSurface, has_planar_profile, meridian, range, turned_to};
+use crate::geometry::{Point, Vector};
+
+/// Number of places along each parameter at which a search for the nearest place of a B-spline starts.
+const STARTS: usize = 32;
+
+/// Outlines in (u, v).
+pub(super) struct TrimmedDomain {
+    outlines: Vec<Vec<[f64; 2]>>,
+    /// Lengths after which u and v repeat; infinite for a parameter that does not.
+    period: [f64; 2],
+    /// True if the places beyond the outlines are meant: with an odd number of outlines that go around once.
+    is_inverted: bool,
+}
+
+impl TrimmedDomain {
+    /// Maps outlines in space to (u, v). Returns the domain around them too.
+    pub(super) fn of_outlines(surface: &ParametricSurface, outlines: &[Vec<Point>]) -> (Self, [[f64; 2]; 2]) {
+        let places: Vec<Point> = outlines.iter().flatten().copied().collect();
+        let domain = surface.domain_near(&places);
+        (Self::new(surface, domain, outlines), domain)
+    }
+
+    /// Maps outlines in space to (u, v). `domain` has the ranges of u and v.
+    fn new(surface: &ParametricSurface, domain: [[f64; 2]; 2], outlines: &[Vec<Point>]) -> Self {
+        let period = period(surface, domain);
+        let mapped = outlines.iter().filter(|outline| outline.len() > 2).map(|outline| {
+            let mut places: Vec<[f64; 2]> = Vec::with_capacity(outline.len());
+            for p in outline {
+                let found = nearest_parameters(surface, domain, p, places.last().copied());
+                let near = places.last().copied().unwrap_or(found);
+                places.push([0, 1].map(|k| unwrapped(found[k], near[k], period[k])));
+            }
+            places
+        });
+        Self { outlines: mapped.collect(), period, is_inverted: false }
+    }
+
+    /// Returns the places of the outlines in (u, v).
+    pub(super) fn border_places(&self) -> impl Iterator<Item = [f64; 2]> {
+        self.outlines.iter().flatten().copied()
+    }
+
+    /// Returns the ranges of u and v in which the enclosed places lie. A parameter around which an outline goes has its
+    /// whole range.
+    pub(super) fn bounds(&self, domain: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
+        let goes_around = |k: usize| {
+            self.outlines.iter().any(|outline| {
+                let [first, last] = [outline[0], outline[outline.len() - 1]];
+                (first[k] - last[k]).abs() > 0.5 * self.period[k]
+            })
+        };
+        if self.outlines.is_empty() || self.is_inverted || goes_around(0) || goes_around(1) {
+            return domain;
+        }
+        [0, 1].map(|k| range(self.border_places().map(|place| place[k])))
+    }
+
+    /// Returns the same domain with the places beyond its outlines.
+    pub(super) fn inverted(self) -> Self {
+        Self { is_inverted: !self.is_inverted, ..self }
+    }
+
+    /// Returns a domain without outlines, which encloses everything.
+    pub(super) fn everything(self) -> Self {
+        Self { outlines: Vec::new(), is_inverted: false, ..self }
+    }
+
+    /// Tells whether one outline, and no other, goes around the surface: then the sides of it cannot be told apart.
+    pub(super) fn is_ambiguous(&self) -> bool {
+        let around = |outline: &&Vec<[f64; 2]>| {
+            let [first, last] = [outline[0], outline[outline.len() - 1]];
+            (first[0] - last[0]).abs() > 0.5 * self.period[0]
+        };
+        self.outlines.iter().filter(around).count() % 2 == 1
+    }
+
+    /// Returns where the outlines cross the line of constant `u`.
+    pub(super) fn column(&self, u: f64) -> Column<'_> {
+        let mut crossings = Vec::new();
+        for outline in &self.outlines {
+            let [low, high] = range(outline.iter().map(|place| place[1]));
+            let next = outline.iter().skip(1).chain(outline.first());
+            for ([ua, va], [ub, vb]) in outline.iter().zip(next) {
+                // The last edge goes back to the first place, which can be a turn away.
+                let ub = unwrapped(*ub, *ua, self.period[0]);
+                let u = unwrapped(u, 0.5 * (ua + ub), self.period[0]);
+                if (*ua > u) != (ub > u) {
+                    crossings.push([va + (u - ua) / (ub - ua) * (vb - va), 0.5 * (low + high)]);
+                }
+            }
+        }
+        Column { domain: self, crossings }
+    }
+}
+
+/// Places of a domain with one u.
+pub(super) struct Column<'a> {
+    domain: &'a TrimmedDomain,
+    /// v of each crossing, and v of the middle of its outline.
+    crossings: Vec<[f64; 2]>,
+}
+
+impl Column<'_> {
+    /// Tells whether the outlines enclose the place with this `v`, by the number of their edges beyond it.
+    pub(super) fn contains(&self, v: f64) -> bool {
+        let TrimmedDomain { outlines, period, is_inverted } = self.domain;
+        // Where v repeats too, the turn of v in which the outline lies.
+        let beyond = self.crossings.iter().filter(|[crossing, middle]| unwrapped(v, *middle, period[1]) < *crossing);
+        outlines.is_empty() || (beyond.count() % 2 == 1) != *is_inverted
+    }
+}
+
+/// Returns `t` moved by whole periods to where it is nearest to `near`.
+fn unwrapped(t: f64, near: f64, period: f64) -> f64 {
+    if period.is_finite() { t + ((near - t) / period).round() * period } else { t }
+}
+
+/// Returns the lengths after which the parameters repeat.
+pub(super) fn period(surface: &ParametricSurface, [u, v]: [[f64; 2]; 2]) -> [f64; 2] {
+    let turn = std::f64::consts::TAU;
+    match surface {
+        ParametricSurface::Plane { .. } | ParametricSurface::Extrusion { .. } => [f64::INFINITY; 2],
+        ParametricSurface::Torus { .. } => [turn; 2],
+        ParametricSurface::BSpline(_) => {
+            let place = |u: f64, v: f64| surface.evaluate(u, v).point;
+            let size = (place(u[0], v[0]) - place(0.5 * (u[0] + u[1]), 0.5 * (v[0] + v[1]))).norm();
+            let closes = |a: [Point; 3], b: [Point; 3]| (0..3).all(|i| (a[i] - b[i]).norm() <= 1e-7 * size);
+            let along = |[low, high]: [f64; 2]| [0.2, 0.5, 0.9].map(|t| low + t * (high - low));
+            let in_u = closes(along(v).map(|t| place(u[0], t)), along(v).map(|t| place(u[1], t)));
+            let in_v = closes(along(u).map(|t| place(t, v[0])), along(u).map(|t| place(t, v[1])));
+            [(in_u, u), (in_v, v)].map(|(closes, [low, high])| if closes { high - low } else { f64::INFINITY })
+        }
+        _ => [turn, f64::INFINITY],
+    }
+}
+
+/// Returns the parameters of the place of a surface that is nearest to `p`. `near` are those of a place nearby.
+pub(super) fn nearest_parameters(
+    surface: &ParametricSurface,
+    domain: [[f64; 2]; 2],
+    p: &Point,
+    near: Option<[f64; 2]>,
+) -> [f64; 2] {
+    let turn = |frame: &super::frame::Frame| {
+        let d = frame.local(p);
+        (d, d.y.atan2(d.x))
+    };
+    match surface {
+        ParametricSurface::Plane { frame } => {
+            let d = frame.local(p);
+            [d.x, d.y]
+        }
+        ParametricSurface::Cylinder { frame, .. } | ParametricSurface::Cone { frame, .. } => {
+            let (d, u) = turn(frame);
+            [u, d.z]
+        }
+        ParametricSurface::Sphere { frame, .. } => {
+            let (d, u) = turn(frame);
+            [u, d.z.atan2(d.x.hypot(d.y))]
+        }
+        ParametricSurface::Torus { frame, major_radius_mm, .. } => {
+            let (d, u) = turn(frame);
+            [u, d.z.atan2(d.x.hypot(d.y) - major_radius_mm)]
+        }
+        ParametricSurface::Revolution { profile, origin, axis } if has_planar_profile(surface) => {
+            let x = meridian(profile, origin, axis).unwrap_or_else(Vector::x);
+            let out = p - origin;
+            let u = out.dot(&axis.cross(&x)).atan2(out.dot(&x));
+            [u, profile.parameter_near(&turned_to(profile, origin, axis, p))]
+        }
+        ParametricSurface::BSpline(_) | ParametricSurface::Extrusion { .. } | ParametricSurface::Revolution { .. } => {
+            let start = near.unwrap_or_else(|| nearest_start(surface, domain, p));
+            let found = descend(surface, domain, p, start);
+            // From a place on the other side of a seam the way leads to its end.
+            let distance = |[u, v]: [f64; 2]| (surface.evaluate(u, v).point - p).norm();
+            if near.is_none() || distance(found) <= 1e-3 {
+                return found;
+            }
+            let other = descend(surface, domain, p, nearest_start(surface, domain, p));
+            if distance(other) < distance(found) { other } else { found }
+        }
+    }
+}
+
+fn nearest_start(surface: &ParametricSurface, [u, v]: [[f64; 2]; 2], p: &Point) -> [f64; 2] {
+    let place = |[low, high]: [f64; 2], i: usize| low + (high - low) * i as f64 / STARTS as f64;
+    let places = (0..=STARTS).flat_map(|i| (0..=STARTS).map(move |j| [place(u, i), place(v, j)]));
+    let distance = |[u, v]: &[f64; 2]| (surface.evaluate(*u, *v).point - p).norm_squared();
+    places.min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap_or([u[0], v[0]])
+}
+
+/// Comes nearer to `p` by the method of Gauss and Newton, within the domain.
+fn descend(surface: &ParametricSurface, domain: [[f64; 2]; 2], p: &Point, start: [f64; 2]) -> [f64; 2] {
+    let mut at = start;
+    for _ in 0..30 {
+        let found = surface.evaluate(at[0], at[1]);
+        let off = p - found.point;
+        let [du, dv] = &found.first;
+        let (e, f, g) = (du.norm_squared(), du.dot(dv), dv.norm_squared());
+        let area = (e * g - f * f).max(1e-12 * e * g);
+        if area == 0.0 {
+            break;
+        }
+        let (a, b) = (off.dot(du), off.dot(dv));
+        let step = [(a * g - b * f) / area, (b * e - a * f) / area];
+        let next = [0, 1].map(|k| (at[k] + step[k]).clamp(domain[k][0], domain[k][1]));
+        let moved = [0, 1].map(|k| (next[k] - at[k]).abs() / (domain[k][1] - domain[k][0]));
+        at = next;
+        if moved[0].max(moved[1]) <= 1e-12 {
+            break;
+        }
+    }
+    at
+}

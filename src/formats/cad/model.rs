@@ -1,0 +1,77 @@
+//! CAD model: faces, of which one is the nominal surface.
+
+use regrind_core::geometry::Pose;
+use regrind_core::surface::SurfaceChoice;
+use regrind_core::surface::parametric::Face;
+
+use super::super::choice_error::{ChoiceError, number_of};
+use super::super::error::FormatError;
+
+/// Face of a CAD model as the file has it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CadFace {
+    /// Its name in the file; empty if it has none.
+    pub name: String,
+    /// Kind of its surface in words.
+    pub kind: String,
+    /// The face, or the reason why it cannot be read.
+    pub face: Result<Face, String>,
+}
+
+/// Faces of a CAD file, in the order of the file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CadModel {
+    /// The faces; the first has the number 1.
+    pub faces: Vec<CadFace>,
+}
+
+impl CadFace {
+    pub(super) fn new(name: String, kind: String, face: Result<Face, FormatError>) -> Self {
+        // The path stands before the message of the file anyhow.
+        let face = face.map_err(|error| match error {
+            FormatError::Unexpected { place, expected, found, .. } => {
+                format!("{place}: expected {expected}, found `{found}`")
+            }
+            error => error.to_string(),
+        });
+        Self { name, kind, face }
+    }
+
+    pub(super) fn moved(&self, motion: &Pose) -> Self {
+        Self { face: self.face.as_ref().map(|face| face.moved(motion)).map_err(Clone::clone), ..self.clone() }
+    }
+}
+
+impl CadModel {
+    pub(super) fn new(faces: Vec<CadFace>) -> Self {
+        Self { faces }
+    }
+
+    /// Returns the number, counted from 1, and the face that is chosen. Without a choice it is the largest.
+    ///
+    /// # Errors
+    /// Returns an error if there is no such face, if several have the name, or if the face cannot be read.
+    pub fn choose(&self, choice: Option<&SurfaceChoice>) -> Result<(usize, &Face), ChoiceError> {
+        let names: Vec<&str> = self.faces.iter().map(|face| &face.name[..]).collect();
+        let number = match choice {
+            Some(SurfaceChoice::Number(number)) => *number,
+            Some(SurfaceChoice::Name(name)) => number_of(name, &names)?,
+            None | Some(SurfaceChoice::Largest) => self.largest()?,
+        };
+        let face = number.checked_sub(1).and_then(|at| self.faces.get(at));
+        let face = face.ok_or(ChoiceError::NoNumber { number, count: self.faces.len() })?;
+        let unreadable =
+            |reason: &String| ChoiceError::Unreadable { number, kind: face.kind.clone(), reason: reason.clone() };
+        face.face.as_ref().map(|face| (number, face)).map_err(unreadable)
+    }
+
+    /// Returns the number of the face with the largest area.
+    fn largest(&self) -> Result<usize, ChoiceError> {
+        let areas = (1..).zip(&self.faces).filter_map(|(n, face)| Some((n, face.face.as_ref().ok()?.area_mm2())));
+        match areas.max_by(|a, b| a.1.total_cmp(&b.1)) {
+            Some((number, area)) if area > 0.0 => Ok(number),
+            // The reason of the first face is as good as any.
+            _ => Ok(1),
+        }
+    }
+}

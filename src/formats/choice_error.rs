@@ -1,0 +1,96 @@
+//! Reasons why no surface of a file can be chosen: a face of a CAD model, or a surface of a lens.
+
+use regrind_core::surface::analytic::DefinitionError;
+use regrind_core::surface::parametric::FaceError;
+use thiserror::Error;
+
+/// Reason why no surface of a file can be chosen.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
+#[non_exhaustive]
+pub enum ChoiceError {
+    /// No surface has the number.
+    #[error("there is no face {number}; the faces have the numbers 1 to {count}: `regrind accuracy` lists them")]
+    NoNumber { number: usize, count: usize },
+    /// A lens has no surface of the number.
+    #[error("the lens has no surface {number}; it has the surfaces {}: `regrind accuracy` lists them", list(.numbers))]
+    NoSurface { number: usize, numbers: Vec<usize> },
+    /// No surface has the name.
+    #[error("nothing has the name `{name}`; {}", names_there(.names))]
+    NoName { name: String, names: Vec<String> },
+    /// Several surfaces have the name.
+    #[error("several have the name `{name}`; choose one by its number: {}", list(.numbers))]
+    SeveralOfName { name: String, numbers: Vec<usize> },
+    /// The surface cannot be read.
+    #[error("face {number}, a {kind}, cannot be the nominal surface: {reason}")]
+    Unreadable { number: usize, kind: String, reason: String },
+    /// A lens has several surfaces, and none was chosen.
+    #[error("the lens has several curved surfaces; choose one by its number: {}", list(.numbers))]
+    SeveralSurfaces { numbers: Vec<usize> },
+    /// A lens has no curved surface.
+    #[error("the lens has no curved surface; choose a plane one by its number")]
+    NoCurvedSurface,
+    /// The file has one surface only, or none to choose from.
+    #[error("the file has no faces to choose from; remove the choice of a face")]
+    NothingToChoose,
+    /// A frame was chosen for a surface that has none of its own.
+    #[error("only a face of a CAD model has a frame of its own; remove the choice of the frame")]
+    NoFrame,
+    /// A sampling was chosen for points, for a mesh, or for a definition that states its own.
+    #[error("only a face of a CAD model is sampled as this says; remove the sampling")]
+    NoSampling,
+    /// The face is no surface over x and y.
+    #[error("face {number}: {source}")]
+    Face { number: usize, source: FaceError },
+    /// The surface of the file is not valid.
+    #[error(transparent)]
+    Definition(#[from] DefinitionError),
+}
+
+/// Returns the number, counted from 1, of the only one of `names` that is `name`.
+pub(super) fn number_of(name: &str, names: &[&str]) -> Result<usize, ChoiceError> {
+    let numbers: Vec<usize> = (1..).zip(names).filter(|(_, other)| **other == name).map(|(number, _)| number).collect();
+    match numbers[..] {
+        [number] => Ok(number),
+        [] => {
+            let mut there: Vec<String> =
+                names.iter().filter(|name| !name.is_empty()).map(ToString::to_string).collect();
+            there.sort();
+            there.dedup();
+            Err(ChoiceError::NoName { name: name.to_owned(), names: there })
+        }
+        _ => Err(ChoiceError::SeveralOfName { name: name.to_owned(), numbers }),
+    }
+}
+
+/// Maximum number of names or numbers in a message.
+const MAX_LISTED: usize = 20;
+
+fn list(numbers: &[usize]) -> String {
+    let words: Vec<String> = numbers.iter().take(MAX_LISTED).map(ToString::to_string).collect();
+    let more = numbers.len().saturating_sub(MAX_LISTED);
+    if more > 0 { format!("{} and {more} more", words.join(", ")) } else { words.join(", ") }
+}
+
+fn names_there(names: &[String]) -> String {
+    let more = names.len().saturating_sub(MAX_LISTED);
+    match names {
+        [] => "nothing in the file has a name: choose by number".to_owned(),
+        names if more == 0 => format!("there are {}", names.join(", ")),
+        names => format!("there are {} and {more} more", names[..MAX_LISTED].join(", ")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn name_must_be_there_once() {
+        let names = ["", "a", "b", "a"];
+        assert_eq!(number_of("b", &names), Ok(3));
+        assert_eq!(number_of("a", &names), Err(ChoiceError::SeveralOfName { name: "a".into(), numbers: vec![2, 4] }));
+        let missing = ChoiceError::NoName { name: "c".into(), names: vec!["a".into(), "b".into()] };
+        assert_eq!(number_of("c", &names), Err(missing));
+    }
+}
