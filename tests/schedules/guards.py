@@ -38,7 +38,8 @@ GUARDS = {
     "a machine that was lost is sent no RESUME": (
         "src/drive/station/commands.rs", "        if self.observed.link_lost {\n            return self.refuse_unsent(MachineRequest::Resume).await;\n        }\n", ""),
     "a station looks again after the loop has hung": (
-        "src/drive/station.rs", "if self.observed.connected => if pulse.is_alive() {", "if self.observed.connected && pulse.is_alive() => if true {"),
+        "src/drive/station.rs", "if self.observed.connected => if pulse.is_alive() {", "if self.observed.connected && pulse.is_alive() => if true {",
+        "schedules", "suspended_computer_continues"),
     "holding goes on when the link is lost": (
         "src/cell/connections.rs", "        if is_holding && phase.moving_device() == Some(device) {\n", "        if is_holding && phase.moving_device() == Some(device) {\n            self.enter_state(Held(phase_after_link_loss(phase)));\n        } else if false {\n"),
     "a question that is not on record makes the machine hold": (

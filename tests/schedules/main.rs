@@ -26,8 +26,10 @@ mod wire;
 
 use std::panic::AssertUnwindSafe;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
-use schedule::{FORGETFUL, FULL_DISK, LIARS, OTHER_WIRES, Schedule, Tally};
+use cue::{Cue, When};
+use schedule::{Act, FORGETFUL, FULL_DISK, LIARS, OTHER_WIRES, Schedule, Tally};
 
 /// Seeds that detect a missing guard that few other seeds detect. A station checks again that the loop is alive (134).
 /// A command that waited for a poll that found the link lost is not sent: START (163) and RESUME (181). No command
@@ -153,6 +155,21 @@ fn death_before_effect_keeps_promises() {
     let schedules: Vec<Schedule> = single.chain(pairs).map(|deaths| Schedule::with_deaths(1, deaths)).collect();
     let tally = run_all(&schedules);
     println!("{effects} effects; {} schedules in {:.1} s: {tally}", schedules.len(), began.elapsed().as_secs_f64());
+}
+
+/// Lets the computer sleep once, at moments of all kinds: the run goes on afterwards, and makes all of its passes.
+#[test]
+fn suspended_computer_continues() {
+    let cues = [Cue::Loaded, Cue::Prepared, Cue::StartOnRecord, Cue::Begins, Cue::Complete];
+    let moments = cues.into_iter().flat_map(|cue| [1, 3].map(|nth| (cue, nth)));
+    let schedule = |(i, (cue, nth)): (usize, (Cue, u32))| {
+        let pause = Duration::from_millis([0, 30, 200, 700][i % 4]);
+        let sleep = Act::Suspend { lasts: Duration::from_millis(2100 + 900 * (i as u64 % 5)) };
+        Schedule { acts: vec![(When::After(cue, nth, pause), sleep)], ..Schedule::with_deaths(1, Vec::new()) }
+    };
+    let schedules: Vec<Schedule> = moments.enumerate().map(schedule).collect();
+    let [undisturbed, disturbed] = [&[Schedule::with_deaths(1, Vec::new())][..], &schedules].map(run_all);
+    assert_eq!(disturbed.passes, undisturbed.passes * schedules.len() as u64, "{disturbed}");
 }
 
 #[test]
