@@ -82,6 +82,12 @@ impl PointSurface {
         row * self.columns + column
     }
 
+    /// Returns the place within the box of the points that is nearest to (x, y).
+    fn clamped(&self, x: f64, y: f64) -> [f64; 2] {
+        let last = [self.columns, self.rows].map(|count| count as f64 * self.cell_mm);
+        [0, 1].map(|k| [x, y][k].clamp(self.first_mm[k], self.first_mm[k] + last[k]))
+    }
+
     /// Returns the squared distance and the index of each of the nearest points, the farthest last.
     fn nearest(&self, x: f64, y: f64) -> Vec<(f64, usize)> {
         let [column, row] = self.place_of(x, y);
@@ -100,11 +106,16 @@ impl PointSurface {
             }
             let is_all = ring > self.columns.max(self.rows);
             if found.len() >= NEAREST || is_all {
-                found.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
-                found.truncate(NEAREST);
+                if found.len() > NEAREST {
+                    // Where many rings are empty, sorting all that they have would take most of the time.
+                    found.select_nth_unstable_by(NEAREST - 1, |a, b| a.0.total_cmp(&b.0));
+                    found.truncate(NEAREST);
+                }
+                let far2 = found.iter().fold(0.0, |far2: f64, (d2, _)| far2.max(*d2));
                 // A point outside the rings is at least this far away, for a place within the grid.
                 let safe_mm = ring as f64 * self.cell_mm;
-                if is_all || found.last().is_some_and(|(far2, _)| *far2 <= safe_mm * safe_mm) {
+                if is_all || far2 <= safe_mm * safe_mm {
+                    found.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
                     return found;
                 }
             }
@@ -118,9 +129,15 @@ impl PointSurface {
         if self.points.is_empty() {
             return [0.0; TERMS];
         }
-        let nearest = self.nearest(x, y);
+        let reach_mm = FAR_CELLS * self.cell_mm;
+        // Outside the box of the points, the search begins at its border: from a place far away it would pass all cells
+        // between.
+        let clamped = self.clamped(x, y);
+        let is_outside = (x - clamped[0]).hypot(y - clamped[1]) > reach_mm;
+        let [sx, sy] = if is_outside { clamped } else { [x, y] };
+        let nearest = self.nearest(sx, sy);
         if let Some((near2, point)) = nearest.first()
-            && near2.sqrt() > FAR_CELLS * self.cell_mm
+            && (is_outside || near2.sqrt() > reach_mm)
         {
             let [px, py, _] = self.points[*point];
             let fit = self.fit(px, py, self.nearest(px, py));
@@ -278,5 +295,21 @@ mod tests {
         let mut points = grid_of(&FreeForm::default(), 10.0);
         points[3][2] = f64::NAN;
         assert!(PointSurface::through(points).is_none());
+    }
+
+    #[test]
+    fn far_places_continue_along_tangent_without_passing_all_cells() {
+        let shape = FreeForm::default();
+        let surface = PointSurface::through(grid_of(&shape, 0.5)).unwrap();
+        for (x, y) in [(51.0 + 3.0, 2.0), (-90.0, 40.0), (0.0, 1e4)] {
+            let [cx, cy] = surface.clamped(x, y);
+            let found = surface.height(x, y);
+            let [gx, gy] = surface.gradient(x, y);
+            assert!(found.is_finite() && gx.is_finite() && gy.is_finite());
+            let tangent = surface.height(cx, cy) + gx * (x - cx) + gy * (y - cy);
+            assert!((found - tangent).abs() < 1e-3 * (1.0 + (x - cx).abs() + (y - cy).abs()), "{x} {y}: {found} {tangent}");
+        }
+        let far = surface.nearest(80.0, 60.0);
+        assert!(far.len() == NEAREST && far.windows(2).all(|pair| pair[0].0 <= pair[1].0));
     }
 }
