@@ -307,7 +307,10 @@ mod tests {
             let [gx, gy] = surface.gradient(x, y);
             assert!(found.is_finite() && gx.is_finite() && gy.is_finite());
             let tangent = surface.height(cx, cy) + gx * (x - cx) + gy * (y - cy);
-            assert!((found - tangent).abs() < 1e-3 * (1.0 + (x - cx).abs() + (y - cy).abs()), "{x} {y}: {found} {tangent}");
+            assert!(
+                (found - tangent).abs() < 1e-3 * (1.0 + (x - cx).abs() + (y - cy).abs()),
+                "{x} {y}: {found} {tangent}"
+            );
         }
         let far = surface.nearest(80.0, 60.0);
         assert!(far.len() == NEAREST && far.windows(2).all(|pair| pair[0].0 <= pair[1].0));

@@ -14,7 +14,7 @@ use regrind::surface::{Nominal, PlaneProjection};
 use serde::Serialize;
 
 use super::choice::word_of;
-use super::face_list::{FaceLine, face_lines, listed};
+use super::face_list::{FaceLine, face_lines, lens_lines, listed};
 use super::failure::Failure;
 use super::nominal::{self, NominalTable};
 use super::words::{counted, three_digits};
@@ -107,7 +107,11 @@ fn judge(arguments: &Arguments) -> Result<(Accuracy, Vec<FaceLine>), Failure> {
     let (path, projection) = (&arguments.nominal, arguments.projection);
     let file = nominal::read(path, projection, &arguments.table.table())?;
     let selection = arguments.table.selection();
-    let faces = if let NominalFile::Faces(model) = &file { face_lines(model, &selection) } else { Vec::new() };
+    let faces = match &file {
+        NominalFile::Faces(model) => face_lines(model, &selection),
+        NominalFile::Lens(lens) => lens_lines(lens, &selection),
+        _ => Vec::new(),
+    };
     let defined = setup::defined_from_file(path, &file, &selection);
     // The faces are what a person needs to choose another one.
     if defined.is_err() && !arguments.json {
@@ -126,7 +130,9 @@ fn judge(arguments: &Arguments) -> Result<(Accuracy, Vec<FaceLine>), Failure> {
                     .and_then(|mesh| mesh.check_is_open())
                     .and_then(|()| estimate_accuracy(NominalPoints::Points { points: &points, projection }))
             }
-            NominalFile::Definition(_) | NominalFile::Faces(_) => unreachable!("they define a surface"),
+            NominalFile::Definition(_) | NominalFile::Faces(_) | NominalFile::Lens(_) => {
+                unreachable!("they define a surface")
+            }
         }
     };
     let estimate = estimate.map_err(|source| Failure::Nominal { path: path.clone(), source })?;

@@ -2,7 +2,8 @@
 
 use std::fmt::Write as _;
 
-use regrind::formats::{CadFace, CadModel};
+use regrind::formats::{CadFace, CadModel, LensModel, LensSurface};
+use regrind::geometry::Aperture;
 use regrind::surface::SurfaceSelection;
 use regrind::surface::parametric::Face;
 use serde::Serialize;
@@ -48,6 +49,25 @@ pub(super) fn face_lines(model: &CadModel, selection: &SurfaceSelection) -> Vec<
     (1..).zip(&model.faces).map(line).collect()
 }
 
+/// Returns the surfaces of a lens in the order of the file.
+pub(super) fn lens_lines(lens: &LensModel, selection: &SurfaceSelection) -> Vec<FaceLine> {
+    let chosen = lens.choose(selection.choice.as_ref()).ok().map(|surface| surface.number);
+    let line = |surface: &LensSurface| {
+        let bounds = surface.aperture.as_ref().map(Aperture::bounds);
+        FaceLine {
+            number: surface.number,
+            name: surface.name.clone(),
+            kind: if surface.is_curved { surface.kind.clone() } else { format!("{}, a plane", surface.kind) },
+            area_mm2: bounds.map(|_| 0.0),
+            size_mm: bounds.map(|[low, high]| [high[0] - low[0], high[1] - low[1], 0.0]),
+            normal: None,
+            reason: surface.surface.as_ref().err().cloned(),
+            chosen: chosen == Some(surface.number),
+        }
+    };
+    lens.surfaces.iter().map(line).collect()
+}
+
 /// Returns the list of the faces as text, the largest first; `*` marks the chosen one.
 pub(super) fn listed(faces: &[FaceLine]) -> String {
     const MAX_LINES: usize = 40;
@@ -60,13 +80,14 @@ pub(super) fn listed(faces: &[FaceLine]) -> String {
         let name = if face.name.is_empty() { String::new() } else { format!(" `{}`", face.name) };
         let about = match (&face.reason, face.area_mm2, face.size_mm) {
             (Some(reason), ..) => format!("cannot be read: {reason}"),
+            (None, Some(0.0), Some([x, y, _])) => format!("{x:.3} x {y:.3} mm"),
             (None, Some(area), Some([x, y, z])) => {
                 let way = face.normal.map(|[x, y, z]| format!(", normal ({x:.3}, {y:.3}, {z:.3})")).unwrap_or_default();
                 format!("{area:.2} mm^2, {x:.3} x {y:.3} x {z:.3} mm{way}")
             }
-            _ => "no area".to_owned(),
+            _ => "no outline".to_owned(),
         };
-        writeln!(text, "{mark} face {}{name}: {}, {about}", face.number, face.kind).expect("text grows");
+        writeln!(text, "{mark} {}{name}: {}, {about}", face.number, face.kind).expect("text grows");
     }
     if sorted.len() > MAX_LINES {
         writeln!(text, "  and {} smaller ones", sorted.len() - MAX_LINES).expect("text grows");

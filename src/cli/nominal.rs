@@ -83,6 +83,7 @@ pub(super) fn read(path: &Path, projection: PlaneProjection, table: &Table) -> R
         NominalFile::Mesh { .. } => "a mesh",
         NominalFile::Definition(_) => "a definition",
         NominalFile::Faces(_) => "a CAD model",
+        NominalFile::Lens(_) => "a lens",
     };
     if projection != PlaneProjection::Auto {
         return Err(Failure::Projection { path: path.to_owned(), what });

@@ -22,11 +22,14 @@ pub enum ChoiceError {
     #[error("several have the name `{name}`; choose one by its number: {}", list(.numbers))]
     SeveralOfName { name: String, numbers: Vec<usize> },
     /// The surface cannot be read.
-    #[error("face {number}, a {kind}, cannot be the nominal surface: {reason}")]
+    #[error("number {number}, {kind}, cannot be the nominal surface: {reason}")]
     Unreadable { number: usize, kind: String, reason: String },
     /// A lens has several surfaces, and none was chosen.
     #[error("the lens has several curved surfaces; choose one by its number: {}", list(.numbers))]
     SeveralSurfaces { numbers: Vec<usize> },
+    /// The surface has no outline in the file.
+    #[error("surface {number} has no outline in the file; give the outline of the part as the aperture")]
+    NoOutline { number: usize },
     /// A lens has no curved surface.
     #[error("the lens has no curved surface; choose a plane one by its number")]
     NoCurvedSurface,

@@ -19,6 +19,7 @@ mod height_map;
 mod jsonl_appender;
 mod layout;
 mod learned;
+mod lens;
 mod map;
 mod measured_map;
 pub mod metropro;
@@ -60,6 +61,7 @@ pub use form_document::save_form;
 pub use height_map::HeightMap;
 pub use jsonl_appender::JsonlAppender;
 pub use learned::{CellRun, KnowledgeOrigin, Learned, LearnedError, SettingIdentity};
+pub use lens::{LensModel, LensSurface, parse_lens, read_lens};
 pub use map::{
     CorrectionIdentities, ErrorMapOrigin, MapNode, parse_error_map, read_error_map, write_correction, write_error_map,
 };
@@ -87,6 +89,7 @@ pub use xml::is_bounded_xml;
 use cad::cad_format;
 use height_map::MapFormat;
 use layout::is_separator_line;
+use lens::lens_format;
 use measured_map::map_format;
 use regrind_core::geometry::Point;
 
@@ -97,6 +100,7 @@ enum Kind {
     Stl,
     Toml,
     Cad,
+    Lens,
     Map(&'static MapFormat),
 }
 
@@ -134,6 +138,7 @@ pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result
         Kind::Stl => wrong("an STL mesh", "export the points, or give the mesh as the nominal"),
         Kind::Toml => wrong("a TOML file", "give the definition as the nominal"),
         Kind::Cad => wrong("a CAD model", "give the model as the nominal"),
+        Kind::Lens => wrong("a lens", "give the lens as the nominal"),
         Kind::Map(format) => format.read_points(path).map(|map| map.points.into()),
     }
 }
@@ -176,6 +181,9 @@ fn kind(path: &Path) -> Result<Kind, FormatError> {
     let (head, length) = (&opened.head[..], opened.length);
     if cad_format(head).is_some() {
         return Ok(Kind::Cad);
+    }
+    if lens_format(head).is_some() {
+        return Ok(Kind::Lens);
     }
     foreign::check_is_ours(path, head)?;
     if ply::is_ply(head) {

@@ -11,6 +11,7 @@ use super::cad::{CadModel, read_cad};
 use super::choice_error::ChoiceError;
 use super::columns::Table;
 use super::error::FormatError;
+use super::lens::{LensModel, read_lens};
 use super::ply::{PlyFile, read_ply};
 use super::points::read_nominal_points;
 use super::stl::{StlFile, read_stl};
@@ -38,6 +39,8 @@ pub enum NominalFile {
     Definition(String),
     /// Faces of a CAD model.
     Faces(CadModel),
+    /// Surfaces of a lens.
+    Lens(LensModel),
 }
 
 impl NominalFile {
@@ -52,6 +55,13 @@ impl NominalFile {
             let placed = face.place(selection.frame, selection.aperture.clone(), sampling);
             let placed = placed.map_err(|source| ChoiceError::Face { number, source })?;
             return Ok(Some(placed.surface));
+        }
+        if let Self::Lens(lens) = self {
+            if selection.frame != FaceFrame::File {
+                return Err(ChoiceError::NoFrame);
+            }
+            let chosen = lens.choose(selection.choice.as_ref())?;
+            return chosen.defined(selection.aperture.clone(), sampling).map(Some);
         }
         if selection.choice.is_some() {
             return Err(ChoiceError::NothingToChoose);
@@ -104,8 +114,8 @@ pub fn read_nominal_with_identity(
     }
 }
 
-/// Reads a nominal surface from a file: points (text, PLY), a mesh (PLY, STL), faces (STEP, IGES), or the text of a TOML
-/// definition. Points and vertices are in millimetres.
+/// Reads a nominal surface from a file: points (text, PLY), a mesh (PLY, STL), faces (STEP, IGES), a lens
+/// (Zemax, Code V), or the text of a TOML definition. Points and vertices are in millimetres.
 ///
 /// The content decides the format. The extension decides only if the content is ambiguous.
 ///
@@ -138,6 +148,7 @@ pub fn read_nominal_as(path: impl AsRef<Path>, table: &Table) -> Result<NominalF
             if triangles.is_empty() { NominalFile::Points(points) } else { NominalFile::Mesh { points, triangles } }
         }
         Kind::Cad => NominalFile::Faces(read_cad(path)?),
+        Kind::Lens => NominalFile::Lens(read_lens(path)?),
         Kind::Map(_) => {
             return Err(FormatError::WrongKind {
                 path: path.to_owned(),

@@ -214,7 +214,9 @@ impl PyNominal {
                     nominal.check_is_open().map_err(data)?;
                     nominal
                 }
-                NominalFile::Definition(_) | NominalFile::Faces(_) => unreachable!("they define a surface"),
+                NominalFile::Definition(_) | NominalFile::Faces(_) | NominalFile::Lens(_) => {
+                    unreachable!("they define a surface")
+                }
             };
             Ok(Self::new(nominal, Some(identity)))
         })

@@ -50,6 +50,9 @@ fn resolve_path(folder: &Path, path: &str) -> PathBuf {
     folder.join(path)
 }
 
+/// Ends of the names of files with surfaces that are sampled.
+const DESIGN_EXTENSIONS: [&str; 7] = ["stp", "step", "p21", "igs", "iges", "zmx", "seq"];
+
 fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Option<NominalSource> {
     let from_formula = "remove this table, or use only a formula: remove `nominal.file` and keep [nominal.surface] and [nominal.aperture]";
     if !document.contains_key("nominal") {
@@ -75,6 +78,16 @@ fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Op
             "is given together with `nominal.file`",
             "the nominal surface comes from a file or from a formula, not from both",
             from_formula,
+        );
+    }
+    let extension = Path::new(file).extension().and_then(|extension| extension.to_str()).map(str::to_lowercase);
+    let is_sampled = extension.is_none_or(|extension| DESIGN_EXTENSIONS.contains(&&extension[..]));
+    if written.sampling.is_some() && !is_sampled {
+        document.report(
+            "nominal.sampling",
+            "is given together with `nominal.file`, which is neither a CAD model nor a lens",
+            "points and meshes are taken as they are",
+            "remove this table",
         );
     }
     let selection = SurfaceSelection {

@@ -91,7 +91,9 @@ pub fn nominal_from_file(
             nominal.check_is_open().map_err(of_surface)?;
             nominal
         }
-        NominalFile::Definition(_) | NominalFile::Faces(_) => unreachable!("they define a surface"),
+        NominalFile::Definition(_) | NominalFile::Faces(_) | NominalFile::Lens(_) => {
+            unreachable!("they define a surface")
+        }
     };
     Ok(with_outline(nominal, selection))
 }

@@ -21,8 +21,8 @@ use regrind::formats::gcode::{
 };
 use regrind::formats::result::{Content, Coordinates, DecimalMark, check_ended, parse_result};
 use regrind::formats::{
-    HeightMap, LIMIT_MM, Learned, X3pFile, parse_cad, parse_metropro, parse_ply, parse_points, parse_sdf, parse_stl,
-    parse_x3p, read_error_map, references::parse_references,
+    HeightMap, LIMIT_MM, Learned, X3pFile, parse_cad, parse_lens, parse_metropro, parse_ply, parse_points, parse_sdf,
+    parse_stl, parse_x3p, read_error_map, references::parse_references,
 };
 use regrind::geometry::{Grid, GridMap, Point};
 use regrind::journal::{Anchor, Reader, RecordKind, canonical_json, verify};
@@ -117,6 +117,18 @@ pub fn cad(bytes: &[u8]) -> bool {
         assert!(face.area_mm2() >= 0.0 || face.area_mm2().is_nan());
         let Ok(placed) = face.place(FaceFrame::Face, None, Sampling::Spacing { spacing_mm: 1.0 }) else { continue };
         let found = placed.surface.formula().sag_and_gradient(0.0, 0.0);
+        assert!(found.is_none_or(|(z, gradient)| (z + gradient[0] + gradient[1]).is_finite()));
+    }
+    true
+}
+
+/// Surfaces of lenses, of Zemax and Code V.
+pub fn lens(bytes: &[u8]) -> bool {
+    let Ok(lens) = parse_lens(path(), bytes) else { return false };
+    assert!(!lens.surfaces.is_empty());
+    for surface in lens.surfaces.iter().take(20) {
+        let Ok(formula) = &surface.surface else { continue };
+        let found = formula.sag_and_gradient(1.0, 2.0);
         assert!(found.is_none_or(|(z, gradient)| (z + gradient[0] + gradient[1]).is_finite()));
     }
     true

@@ -170,6 +170,29 @@ impl OffAxis {
     }
 }
 
+/// Sum of surfaces, each shifted in x and y.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SurfaceSum {
+    parts: Vec<(AnalyticSurface, [f64; 2])>,
+}
+
+impl SurfaceSum {
+    /// Creates the sum of surfaces, each with the place in mm of its origin.
+    pub fn new(parts: Vec<(AnalyticSurface, [f64; 2])>) -> Self {
+        Self { parts }
+    }
+
+    /// Returns the sag z and its gradient (dz/dx, dz/dy) at (`x`, `y`); `None` where one of the surfaces has no value.
+    ///
+    /// Units: millimetres; the gradient has none.
+    pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
+        self.parts.iter().try_fold((0.0, [0.0; 2]), |(sum, [sx, sy]), (surface, shift)| {
+            let (z, [gx, gy]) = surface.sag_and_gradient(x - shift[0], y - shift[1])?;
+            Some((sum + z, [sx + gx, sy + gy]))
+        })
+    }
+}
+
 /// Surface given by a formula, or by a face of a CAD model, with checked numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub enum AnalyticSurface {
@@ -191,6 +214,8 @@ pub enum AnalyticSurface {
     Qcon(Qcon),
     /// Forbes' polynomials for mild aspheres.
     Qbfs(Qbfs),
+    /// Sum of surfaces, each shifted.
+    Sum(SurfaceSum),
     /// Face of a CAD model, of which the place (u, v) of each (x, y) is found.
     Face(Arc<HeightField>),
 }
@@ -213,6 +238,7 @@ impl AnalyticSurface {
             Self::Biconic(biconic) => biconic.sag_and_gradient(x, y),
             Self::XyPolynomial(polynomial) => polynomial.sag_and_gradient(x, y),
             Self::Zernike(zernike) => zernike.sag_and_gradient(x, y),
+            Self::Sum(sum) => sum.sag_and_gradient(x, y),
             Self::Face(field) => field.sag_and_gradient(x, y),
         };
         found.filter(|(z, [gx, gy])| z.is_finite() && gx.is_finite() && gy.is_finite())
@@ -261,6 +287,7 @@ impl AnalyticSurface {
             Self::Toroid(toroid) => toroid.term_count(),
             Self::XyPolynomial(polynomial) => polynomial.term_count(),
             Self::Zernike(zernike) => zernike.term_count(),
+            Self::Sum(sum) => sum.parts.iter().map(|(surface, _)| surface.term_count()).sum(),
             Self::Face(field) => field.term_count(),
         }
     }

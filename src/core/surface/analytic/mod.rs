@@ -21,7 +21,7 @@ mod sampling;
 mod toroid;
 mod zernike;
 
-pub use analytic_surface::{AnalyticSurface, OffAxis, SectionFrame};
+pub use analytic_surface::{AnalyticSurface, OffAxis, SectionFrame, SurfaceSum};
 pub use conic::{Asphere, AsphereDefinition, Conic, ConicDefinition};
 pub use definition::{
     DefinedSurface, Formula, OffAxisDefinition, PlaneDefinition, Sampling, SamplingDefinition, SphereDefinition,

@@ -345,7 +345,8 @@ pub(super) mod tests {
     fn curvatures_by_hand() {
         let close = |found: Option<[f64; 2]>, expected: [f64; 2]| {
             let found = found.unwrap();
-            (found[0] - expected[0]).abs() < 1e-14 && (found[1] - expected[1]).abs() < 1e-14
+            // Where both are equal, rounding of their difference shows as its root.
+            (found[0] - expected[0]).abs() < 1e-8 && (found[1] - expected[1]).abs() < 1e-8
         };
         let [plane, cylinder, _, sphere, torus, ..] = &kinds()[..] else { unreachable!() };
         assert!(close(plane.evaluate(1.0, 2.0).principal_curvatures(), [0.0, 0.0]));

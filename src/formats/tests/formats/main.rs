@@ -2,6 +2,7 @@
 
 mod cad;
 mod headers;
+mod lens;
 mod map_files;
 mod points;
 mod real_files;

@@ -1,0 +1,87 @@
+//! Lens of a design program: its surfaces, of which one is the nominal surface.
+
+use regrind_core::geometry::Aperture;
+use regrind_core::surface::SurfaceChoice;
+use regrind_core::surface::analytic::{AnalyticSurface, DefinedSurface, Sampling};
+
+use super::super::choice_error::{ChoiceError, number_of};
+
+/// Surface of a lens.
+///
+/// Frame: the origin is at the vertex, z runs along the light. Units: millimetres.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LensSurface {
+    /// Its number in the file.
+    pub number: usize,
+    /// Comment or label; empty if it has none.
+    pub name: String,
+    /// Type as the file has it.
+    pub kind: String,
+    /// Whether the surface is not a plane.
+    pub is_curved: bool,
+    /// Outline in the file.
+    pub aperture: Option<Aperture>,
+    /// The surface, or the reason why it cannot be taken.
+    pub surface: Result<AnalyticSurface, String>,
+}
+
+/// Surfaces of a lens, in the order of the file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LensModel {
+    /// The surfaces.
+    pub surfaces: Vec<LensSurface>,
+}
+
+impl LensModel {
+    /// Returns the surface that is chosen. Without a choice it is the only curved one.
+    ///
+    /// # Errors
+    /// Returns an error if there is no such surface, if several fit, or if the surface cannot be taken.
+    pub fn choose(&self, choice: Option<&SurfaceChoice>) -> Result<&LensSurface, ChoiceError> {
+        let found = match choice {
+            Some(SurfaceChoice::Number(number)) => {
+                let numbers = || self.surfaces.iter().map(|surface| surface.number).collect();
+                let found = self.surfaces.iter().find(|surface| surface.number == *number);
+                found.ok_or_else(|| ChoiceError::NoSurface { number: *number, numbers: numbers() })?
+            }
+            Some(SurfaceChoice::Name(name)) => {
+                let names: Vec<&str> = self.surfaces.iter().map(|surface| &surface.name[..]).collect();
+                &self.surfaces[number_of(name, &names)? - 1]
+            }
+            None | Some(SurfaceChoice::Largest) => {
+                let curved: Vec<&LensSurface> = self.surfaces.iter().filter(|surface| surface.is_curved).collect();
+                match curved[..] {
+                    [one] => one,
+                    [] => return Err(ChoiceError::NoCurvedSurface),
+                    _ => {
+                        let numbers = curved.iter().map(|surface| surface.number).collect();
+                        return Err(ChoiceError::SeveralSurfaces { numbers });
+                    }
+                }
+            }
+        };
+        match &found.surface {
+            Ok(_) => Ok(found),
+            Err(reason) => {
+                let (number, kind, reason) = (found.number, found.kind.clone(), reason.clone());
+                Err(ChoiceError::Unreadable { number, kind, reason })
+            }
+        }
+    }
+}
+
+impl LensSurface {
+    /// Returns the surface with its outline. `aperture` replaces the outline of the file.
+    ///
+    /// # Errors
+    /// Returns an error if the surface cannot be taken, if there is no outline, or if the surface is not defined within
+    /// it.
+    pub fn defined(&self, aperture: Option<Aperture>, sampling: Sampling) -> Result<DefinedSurface, ChoiceError> {
+        let unreadable =
+            |reason: String| ChoiceError::Unreadable { number: self.number, kind: self.kind.clone(), reason };
+        let surface = self.surface.clone().map_err(unreadable)?;
+        let aperture = aperture.or_else(|| self.aperture.clone());
+        let aperture = aperture.ok_or(ChoiceError::NoOutline { number: self.number })?;
+        Ok(DefinedSurface::new(surface, aperture, sampling)?)
+    }
+}

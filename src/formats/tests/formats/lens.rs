@@ -1,0 +1,123 @@
+//! Lens files of Zemax and Code V, against the sag that their formulas and other readers give.
+
+use std::path::{Path, PathBuf};
+
+use regrind_core::geometry::Aperture;
+use regrind_core::surface::SurfaceChoice;
+use regrind_core::surface::analytic::Sampling;
+use regrind_formats::{ChoiceError, parse_lens, read_lens};
+
+fn folder() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/lens")
+}
+
+/// Types that are refused by their names, and surfaces with a peak.
+const REFUSED: [&str; 4] = ["CV-XTO", "CV-AAS", "ODDASPHE", "XOSPHERE"];
+
+#[test]
+fn sags_match_formulas() {
+    let text = std::fs::read_to_string(folder().join("truth.csv")).unwrap();
+    let (mut wrong, mut count) = (Vec::new(), 0);
+    for line in text.lines().skip(1) {
+        let cells: Vec<&str> = line.split(',').collect();
+        let (file, number): (_, usize) = (cells[0], cells[1].parse().unwrap());
+        if REFUSED.iter().any(|kind| file.starts_with(kind)) {
+            continue;
+        }
+        let [x, y, z] = [2, 3, 4].map(|k| cells[k].parse::<f64>().unwrap());
+        let lens = read_lens(folder().join(file)).unwrap_or_else(|error| panic!("{error}"));
+        let found = match lens.choose(Some(&SurfaceChoice::Number(number))) {
+            Ok(surface) => surface.surface.as_ref().unwrap().sag(x, y),
+            Err(error) => {
+                wrong.push(format!("{file}: {error}"));
+                continue;
+            }
+        };
+        count += 1;
+        if found.is_none_or(|found| (found - z).abs() > 2e-12) {
+            wrong.push(format!("{file} at {x}, {y}: {found:?} instead of {z}"));
+        }
+    }
+    wrong.dedup_by_key(|line| line.split(' ').next().map(ToOwned::to_owned));
+    assert!(wrong.is_empty(), "{wrong:#?}");
+    assert!(count > 400, "{count}");
+}
+
+/// The term of the first power has a peak on the axis. Without it, odd aspheres are read.
+#[test]
+fn odd_aspheres_are_read_without_peak() {
+    let text = std::fs::read_to_string(folder().join("truth.csv")).unwrap();
+    for (file, line) in [("ODDASPHE-in-utf8.zmx", "PARM 1 "), ("XOSPHERE-mm-utf8.zmx", "XDAT 3 ")] {
+        let lens = std::fs::read_to_string(folder().join(file)).unwrap();
+        let first = lens.lines().find(|l| l.trim().starts_with(line)).unwrap();
+        let slope: f64 = first.split_whitespace().nth(2).unwrap().parse().unwrap();
+        let refused = parse_lens(Path::new(file), lens.as_bytes()).unwrap();
+        assert!(matches!(refused.choose(None), Err(ChoiceError::Unreadable { number: 1, .. })), "{file}");
+
+        let flat = lens.replace(first, &format!("  {line}0.0"));
+        let flat = parse_lens(Path::new(file), flat.as_bytes()).unwrap();
+        let surface = flat.choose(None).unwrap().surface.as_ref().unwrap();
+        // The slope has no unit; a normalised coefficient is a length over the normalisation radius.
+        let radius = lens
+            .lines()
+            .find_map(|l| l.trim().strip_prefix("XDAT 2 "))
+            .map(|l| l.split_whitespace().next().unwrap().parse::<f64>().unwrap());
+        let slope = slope / radius.unwrap_or(1.0);
+        for row in text.lines().filter(|row| row.starts_with(file)) {
+            let cells: Vec<f64> = row.split(',').skip(2).map(|cell| cell.parse().unwrap()).collect();
+            let [x, y, z] = cells[..] else { panic!("{row}") };
+            let found = surface.sag(x, y).unwrap() + slope * x.hypot(y);
+            assert!((found - z).abs() < 2e-12, "{row}: {found}");
+        }
+    }
+}
+
+#[test]
+fn semi_diameter_becomes_outline() {
+    let lens = read_lens(folder().join("EVENASPH-in.zmx")).unwrap();
+    let surface = lens.choose(None).unwrap();
+    let sampling = Sampling::Spacing { spacing_mm: 1.0 };
+    let Aperture::Circle { radius_mm, .. } = surface.defined(None, sampling).unwrap().aperture().clone() else {
+        panic!("a circle")
+    };
+    assert!((radius_mm - 15.0).abs() < 1e-9, "{radius_mm}");
+    // Code V has an aperture only if a statement gives one.
+    let lens = read_lens(folder().join("CV-ASP-mm.seq")).unwrap();
+    let surface = lens.choose(None).unwrap();
+    assert_eq!(surface.defined(None, sampling), Err(ChoiceError::NoOutline { number: 1 }));
+    let given = Aperture::Circle { centre_mm: [0.0; 2], radius_mm: 12.0 };
+    assert_eq!(surface.defined(Some(given.clone()), sampling).unwrap().aperture(), &given);
+}
+
+#[test]
+fn surface_of_lens_is_chosen() {
+    let text = "UNIT MM\nSURF 0\n  TYPE STANDARD\n  CURV 0.0\nSURF 1\n  COMM front\n  TYPE STANDARD\n  CURV 0.01\n  DIAM 5\n\
+                SURF 2\n  TYPE COORDBRK\n  PARM 3 5\nSURF 3\n  COMM back\n  TYPE STANDARD\n  CURV -0.02\n  DIAM 5\n\
+                SURF 4\n  TYPE BINARY_2\n  CURV 0\n  PARM 1 3\n";
+    let lens = parse_lens(Path::new("a.zmx"), text.as_bytes()).unwrap();
+    assert_eq!(lens.choose(None), Err(ChoiceError::SeveralSurfaces { numbers: vec![1, 3, 4] }));
+    assert_eq!(lens.choose(Some(&SurfaceChoice::Name("back".into()))).unwrap().number, 3);
+    let coordinate_break = lens.choose(Some(&SurfaceChoice::Number(2)));
+    assert!(matches!(coordinate_break, Err(ChoiceError::Unreadable { number: 2, .. })));
+    let unknown = lens.choose(Some(&SurfaceChoice::Number(4)));
+    assert!(matches!(unknown, Err(ChoiceError::Unreadable { number: 4, .. })));
+    let missing = ChoiceError::NoSurface { number: 9, numbers: vec![0, 1, 2, 3, 4] };
+    assert_eq!(lens.choose(Some(&SurfaceChoice::Number(9))), Err(missing));
+}
+
+#[test]
+fn damaged_lens_files_are_refused() {
+    let path = Path::new("a.zmx");
+    let text = std::fs::read_to_string(folder().join("EVENASPH-mm-utf8.zmx")).unwrap();
+    assert!(parse_lens(path, text.replace("UNIT MM", "UNIT FT").as_bytes()).is_err());
+    assert!(parse_lens(path, text.replace("  CURV ", "  CURV x").as_bytes()).is_err());
+    assert!(parse_lens(path, text.replace("SURF 1", "SURF one").as_bytes()).is_err());
+    assert!(parse_lens(path, b"x,y,z\n1,2,3\n").is_err());
+    // A number of S without RDM can be a radius or a curvature.
+    let codev = std::fs::read_to_string(folder().join("CV-SPH-mm.seq")).unwrap();
+    let silent = parse_lens(path, codev.replace("RDM", "TITLE 'x'").as_bytes()).unwrap();
+    assert!(matches!(silent.choose(Some(&SurfaceChoice::Number(1))), Err(ChoiceError::Unreadable { .. })));
+    let unitless = parse_lens(path, codev.replace("DIM", "DUM").as_bytes()).unwrap();
+    assert!(matches!(unitless.choose(Some(&SurfaceChoice::Number(1))), Err(ChoiceError::Unreadable { .. })));
+    assert!(parse_lens(path, codev.replace("DIM   M", "DIM   F").as_bytes()).is_err());
+}
