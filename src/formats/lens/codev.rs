@@ -113,87 +113,81 @@ struct Reader<'a> {
     has_radii: Option<bool>,
 }
 
+/// Statement of the file.
+struct Statement<'a> {
+    path: &'a Path,
+    line: usize,
+    words: &'a [String],
+}
+
+impl Statement<'_> {
+    fn wrong(&self, expected: &str) -> FormatError {
+        FormatError::Unexpected {
+            path: self.path.to_owned(),
+            place: format!("line {}", self.line),
+            expected: expected.to_owned(),
+            found: excerpt(self.words.join(" ").as_bytes()),
+        }
+    }
+
+    /// Returns a word in upper case; empty if there is none.
+    fn word(&self, at: usize) -> String {
+        self.words.get(at).map(|word| word.to_uppercase()).unwrap_or_default()
+    }
+
+    fn value(&self, at: usize) -> Result<f64, FormatError> {
+        let value = self.words.get(at).and_then(|word| word.parse::<f64>().ok()).filter(|value| value.is_finite());
+        value.ok_or_else(|| self.wrong("a number"))
+    }
+
+    fn is_number(&self, at: usize) -> bool {
+        self.words.get(at).is_some_and(|word| word.parse::<f64>().is_ok())
+    }
+}
+
 impl Reader<'_> {
     fn take_statement(&mut self, line: usize, words: &[String]) -> Result<(), FormatError> {
-        let wrong = |expected: &str| FormatError::Unexpected {
-            path: self.path.to_owned(),
-            place: format!("line {line}"),
-            expected: expected.to_owned(),
-            found: excerpt(words.join(" ").as_bytes()),
-        };
-        let keyword = words[0].to_uppercase();
-        let value = |at: usize| -> Result<f64, FormatError> {
-            let value = words.get(at).and_then(|word| word.parse::<f64>().ok()).filter(|value| value.is_finite());
-            value.ok_or_else(|| wrong("a number"))
-        };
+        let statement = Statement { path: self.path, line, words };
+        let keyword = statement.word(0);
         match keyword.as_str() {
             "DIM" => {
-                self.unit_mm = match words.get(1).map(|word| word.to_uppercase()).unwrap_or_default().as_str() {
+                self.unit_mm = match statement.word(1).as_str() {
                     "M" | "MM" => Some(1.0),
                     "C" | "CM" => Some(10.0),
                     "I" | "IN" => Some(25.4),
-                    _ => return Err(wrong("the unit M (millimetre), C or I")),
+                    _ => return Err(statement.wrong("the unit M (millimetre), C or I")),
                 };
                 return Ok(());
             }
             "RDM" => {
-                self.has_radii = Some(words.get(1).is_none_or(|word| !word.eq_ignore_ascii_case("no")));
+                self.has_radii = Some(statement.word(1) != "NO");
                 return Ok(());
             }
             _ => {}
         }
         if let Some(number) = begun_surface(&keyword) {
-            let block = Block { value: if words.len() > 1 { value(1)? } else { 0.0 }, ..Block::default() };
-            match number {
-                // A numbered surface that is not there yet is the next one.
-                Some(number) if number < self.blocks.len() => self.blocks[number].value = block.value,
-                Some(number) if number > self.blocks.len() + 1 => return Err(wrong("surfaces in order")),
-                Some(1) if self.blocks.is_empty() => self.blocks.extend([Block::default(), block]),
-                _ => self.blocks.push(block),
-            }
-            return Ok(());
+            return self.begin_surface(number, &statement);
         }
         // `K S2 -1` and `K -1`.
-        let named = words.get(1).and_then(|word| {
-            let digits = word.strip_prefix(['S', 's'])?;
-            digits.parse::<usize>().ok()
-        });
+        let named = statement.word(1).strip_prefix('S').and_then(|digits| digits.parse::<usize>().ok());
         let at = if named.is_some() { 2 } else { 1 };
         let count = self.blocks.len();
-        let Some(index) = named.or(count.checked_sub(1)).filter(|index| *index < count) else { return Ok(()) };
-        let block = &mut self.blocks[index];
-        match keyword.as_str() {
-            "SPH" | "CON" | "ASP" | "YTO" | "XTO" | "CYL" | "AAS" | "DIF" | "GRX" | "UDS" => block.kind = keyword,
-            // The base of a Fresnel surface; 0 says that there is none.
-            "CUF" if words.len() > at && value(at)? != 0.0 => block.kind = keyword,
-            "SPS" => {
-                block.kind = words.get(at).map(|word| word.to_uppercase()).unwrap_or_default();
-                if words.len() > at + 1 {
-                    block.special.insert("SIZE".to_owned(), value(at + 1)?);
-                }
-            }
-            "SCO" => {
-                let name = words.get(at).map(|word| word.to_uppercase()).ok_or_else(|| wrong("a coefficient"))?;
-                block.special.insert(name, value(at + 1)?);
-            }
-            "K" => block.conic = value(at)?,
-            "RDY" => block.radius = Some(value(at)?),
-            "CUY" => block.curvature = Some(value(at)?),
-            "RDX" => block.radius_x = value(at)?,
-            "CUX" => block.curvature_x = Some(value(at)?),
-            "SLB" => block.label = words.get(at).cloned().unwrap_or_default(),
-            "CIR" if words.get(at).is_some_and(|word| word.parse::<f64>().is_ok()) => block.circle = Some(value(at)?),
-            "REX" if words.get(at).is_some_and(|word| word.parse::<f64>().is_ok()) => {
-                block.rectangle[0] = Some(value(at)?)
-            }
-            "REY" if words.get(at).is_some_and(|word| word.parse::<f64>().is_ok()) => {
-                block.rectangle[1] = Some(value(at)?)
-            }
-            letter => {
-                if let Some(k) = LETTERS.iter().position(|known| *known == letter) {
-                    block.letters.insert(k, value(at)?);
-                }
-            }
+        match named.or(count.checked_sub(1)).filter(|index| *index < count) {
+            Some(index) => self.blocks[index].take_statement(&keyword, at, &statement),
+            None => Ok(()),
+        }
+    }
+
+    /// Begins a surface, or gives a numbered one its radius or curvature.
+    fn begin_surface(&mut self, number: Option<usize>, statement: &Statement<'_>) -> Result<(), FormatError> {
+        let value = if statement.words.len() > 1 { statement.value(1)? } else { 0.0 };
+        let block = Block { value, ..Block::default() };
+        match number {
+            // A numbered surface that is not there yet is the next one.
+            Some(number) if number < self.blocks.len() => self.blocks[number].value = value,
+            Some(number) if number > self.blocks.len() + 1 => return Err(statement.wrong("surfaces in order")),
+            Some(1) if self.blocks.is_empty() => self.blocks.extend([Block::default(), block]),
+            _ => self.blocks.push(block),
         }
         Ok(())
     }
@@ -212,6 +206,39 @@ fn begun_surface(keyword: &str) -> Option<Option<usize>> {
 }
 
 impl Block {
+    /// Takes a statement about this surface. Its values begin with the word `at`.
+    fn take_statement(&mut self, keyword: &str, at: usize, statement: &Statement<'_>) -> Result<(), FormatError> {
+        match keyword {
+            "SPH" | "CON" | "ASP" | "YTO" | "XTO" | "CYL" | "AAS" | "DIF" | "GRX" | "UDS" => {
+                self.kind = keyword.to_owned();
+            }
+            // The base of a Fresnel surface; 0 says that there is none.
+            "CUF" if statement.is_number(at) && statement.value(at)? != 0.0 => self.kind = keyword.to_owned(),
+            "SPS" => {
+                self.kind = statement.word(at);
+                if statement.is_number(at + 1) {
+                    self.special.insert("SIZE".to_owned(), statement.value(at + 1)?);
+                }
+            }
+            "SCO" => drop(self.special.insert(statement.word(at), statement.value(at + 1)?)),
+            "K" => self.conic = statement.value(at)?,
+            "RDY" => self.radius = Some(statement.value(at)?),
+            "CUY" => self.curvature = Some(statement.value(at)?),
+            "RDX" => self.radius_x = statement.value(at)?,
+            "CUX" => self.curvature_x = Some(statement.value(at)?),
+            "SLB" => self.label = statement.words.get(at).cloned().unwrap_or_default(),
+            "CIR" if statement.is_number(at) => self.circle = Some(statement.value(at)?),
+            "REX" if statement.is_number(at) => self.rectangle[0] = Some(statement.value(at)?),
+            "REY" if statement.is_number(at) => self.rectangle[1] = Some(statement.value(at)?),
+            letter => {
+                if let Some(k) = LETTERS.iter().position(|known| *known == letter) {
+                    self.letters.insert(k, statement.value(at)?);
+                }
+            }
+        }
+        Ok(())
+    }
+
     fn surface(&self, number: usize, unit_mm: Option<f64>, has_radii: Option<bool>) -> LensSurface {
         let unit = unit_mm.unwrap_or(1.0);
         let kind = if self.kind.is_empty() { "SPH" } else { &self.kind };
