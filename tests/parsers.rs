@@ -147,7 +147,7 @@ macro_rules! survives {
 }
 
 survives! {
-    anchor 256, cad 256, content 1024, definition 2048, event 1024, journal 256, learned 1024, lens 512, metropro 1024, order 2048, payload 2048, ply 2048, points 2048,
+    anchor 256, cad 256, content 1024, definition 2048, event 1024, journal 256, learned 1024, lens 512, map 1024, metropro 1024, order 2048, payload 2048, ply 2048, points 2048,
     program 512, program_map 512, record 1024, references 2048, result 2048, sdf 2048, stl 2048, x3p 1024, x3p_document 1024,
 }
 

@@ -14,16 +14,15 @@ pub(super) struct Foreign {
 }
 
 /// Formats that are read, for the message.
-const EXPECTED: &str = "points as text or PLY, a mesh, or a map as X3P, SDF or MetroPro";
+const EXPECTED: &str = "points as text or PLY, a mesh, or a map of heights of a known format";
 
 const AS_TEXT: &str = "save the sheet with the points as CSV";
 const UNPACK: &str = "unpack it and give the file that is in it";
 const SAMPLE: &str = "give it as the nominal surface, or export points as text";
 const DEFINE: &str = "write the equation of the surface into a definition (TOML), or export points as text";
-const MAP: &str = "export the map as X3P, or as SDF of version 1.0";
 
 /// First bytes that are unique to a format.
-const BEGINNINGS: [(&[u8], &str, &str); 20] = [
+const BEGINNINGS: [(&[u8], &str, &str); 17] = [
     (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "a workbook of an old Excel, or another file of Office (xls)", AS_TEXT),
     (b"\x1f\x8b", "a file packed by gzip", UNPACK),
     (b"BZh", "a file packed by bzip2", UNPACK),
@@ -31,11 +30,6 @@ const BEGINNINGS: [(&[u8], &str, &str); 20] = [
     (b"\x28\xb5\x2f\xfd", "a file packed by zstd", UNPACK),
     (b"7z\xbc\xaf\x27\x1c", "a 7z archive", UNPACK),
     (b"Rar!\x1a\x07", "a RAR archive", UNPACK),
-    (
-        b"\x89HDF\r\n\x1a\n",
-        "an HDF5 file (.datx of Zygo Mx is one)",
-        "export .dat (MetroPro) or X3P from the instrument's program, or points as text",
-    ),
     (b"%PDF", "a PDF", "export the points as text"),
     (b"\x89PNG", "a picture", "export the heights as X3P or SDF, or points as text"),
     (b"\xff\xd8\xff", "a picture", "export the heights as X3P or SDF, or points as text"),
@@ -44,8 +38,6 @@ const BEGINNINGS: [(&[u8], &str, &str); 20] = [
     (b"ISO-10303-21;", "a STEP file", SAMPLE),
     (b"DMISMN/", "a DMIS program", "give the results that it writes, as DMIS output or as points in a table"),
     (b"DMISMD/", "a DMIS program", "give the results that it writes, as DMIS output or as points in a table"),
-    (b"Wyko ASCII Data File", "an ASCII map of Wyko Vision", MAP),
-    (b"Zygo XYZ Data File", "an XYZ map of Zygo", "save the map as .dat (MetroPro) or X3P"),
     (b"Zygo ASCII Data File", "an ASCII map of Zygo", "save the map as .dat (MetroPro) or X3P"),
     (b"BEGIN PGM", "a program in Klartext", "give the measured points"),
 ];
@@ -57,7 +49,7 @@ pub(super) fn foreign(head: &[u8]) -> Option<Foreign> {
     let text = plain.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&plain).trim_ascii_start();
     let begins = BEGINNINGS.iter().find(|(bytes, ..)| text.starts_with(bytes) || head.starts_with(bytes));
     let begins = begins.map(|(_, found, remedy)| Foreign { found, remedy });
-    begins.or_else(|| packed(head)).or_else(|| by_lines(text)).or_else(|| surface_data(head))
+    begins.or_else(|| packed(head)).or_else(|| by_lines(text))
 }
 
 /// Rejects a file if its first bytes belong to a known format that this program does not read.
@@ -155,21 +147,6 @@ fn by_lines(text: &[u8]) -> Option<Foreign> {
     Some(Foreign { found, remedy })
 }
 
-/// Detects SDF files of a version in which heights have another meaning than in version 1.0; `None` for any other file.
-fn surface_data(head: &[u8]) -> Option<Foreign> {
-    const AGAIN: &str = "export it as SDF of version 1.0 (ISO), or as X3P";
-    let version = head.get(1..8).filter(|_| matches!(head[0], b'a' | b'b' | b'A' | b'B'))?.to_ascii_uppercase();
-    let found = match &version[..] {
-        b"BCR-0.0" | b"BCR-1.0" => {
-            "SDF of 1993 (BCR-1.0), which defines neither the mark of a height that was not measured nor the \
-             direction of the profiles"
-        }
-        b"ISO-2.0" => "SDF version 2.0",
-        _ => return None,
-    };
-    Some(Foreign { found, remedy: AGAIN })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -184,7 +161,7 @@ mod tests {
             let length = (name.len() as u16).to_le_bytes();
             [b"PK\x03\x04".to_vec(), vec![0; 22], length.to_vec(), vec![0; 2], name.as_bytes().to_vec()].concat()
         };
-        let cases: [(&[u8], &str); 14] = [
+        let cases: [(&[u8], &str); 11] = [
             (step, "STEP"),
             (iges.as_bytes(), "IGES"),
             (&wide, "Zemax"),
@@ -192,13 +169,10 @@ mod tests {
             (&sheet("xl/workbook.xml"), "xlsx"),
             (&sheet("[Content_Types].xml"), "xlsx"),
             (b"\x1f\x8b\x08", "gzip"),
-            (b"\x89HDF\r\n\x1a\n\0", "datx"),
             (b"! grid\nGRD 5 5 SUR WVL 0.6328\n1 2 3\n", "Code V"),
             (b"5 5 5.0 5.0 0 0.0 0.0\n2.0e-03 0 0 0\n", "sags"),
             (b"DIM LOC1= LOCATION OF POINT PNT1\n", "PC-DMIS"),
             (b"<?xml version=\"1.0\"?>\n<QIFDocument>", "QIF"),
-            (b"aBCR-1.0\n", "BCR-1.0"),
-            (b"bISO-2.0\n", "2.0"),
         ];
         for (head, name) in cases {
             assert!(foreign(head).is_some_and(|foreign| foreign.found.contains(name)), "{name}: {:?}", foreign(head));

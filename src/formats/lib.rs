@@ -21,6 +21,7 @@ mod layout;
 mod learned;
 mod lens;
 mod map;
+mod maps;
 mod measured_map;
 pub mod metropro;
 mod nominal_file;
@@ -65,7 +66,7 @@ pub use lens::{LensModel, LensSurface, parse_lens, read_lens};
 pub use map::{
     CorrectionIdentities, ErrorMapOrigin, MapNode, parse_error_map, read_error_map, write_correction, write_error_map,
 };
-pub use measured_map::is_map;
+pub use measured_map::{is_map, parse_map};
 pub use metropro::{parse_metropro, read_metropro};
 pub use nominal_file::{NominalFile, read_nominal, read_nominal_as, read_nominal_with_identity};
 pub use note::{NotedPoints, PointNote};
@@ -105,7 +106,7 @@ enum Kind {
 }
 
 /// Reads measured points, in millimetres and in the order of the file. The file is text, PLY (its vertices are the
-/// points), or a map (X3P, SDF or MetroPro; its measured samples are the points).
+/// points), or a map of heights (its measured samples are the points).
 ///
 /// The points of a map lie on the surface. The points of another file can lie on the surface or can be the centres of a
 /// spherical probe; the file does not show which.
@@ -127,7 +128,7 @@ pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> 
 pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
     let wrong = |found, remedy| {
-        let expected = "measured points as text or PLY, or a map as X3P, SDF or MetroPro";
+        let expected = "measured points as text or PLY, or a map of heights of a known format";
         Err(FormatError::WrongKind { path: path.to_owned(), expected, found, remedy })
     };
     let kind = kind(path)?;
@@ -179,6 +180,10 @@ fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatE
 fn kind(path: &Path) -> Result<Kind, FormatError> {
     let opened = whole::open(path)?;
     let (head, length) = (&opened.head[..], opened.length);
+    // Some maps begin with a line of text, which other readers refuse by name.
+    if let Some(format) = map_format(head) {
+        return Ok(Kind::Map(format));
+    }
     if cad_format(head).is_some() {
         return Ok(Kind::Cad);
     }
@@ -188,9 +193,6 @@ fn kind(path: &Path) -> Result<Kind, FormatError> {
     foreign::check_is_ours(path, head)?;
     if ply::is_ply(head) {
         return Ok(Kind::Ply);
-    }
-    if let Some(format) = map_format(head) {
-        return Ok(Kind::Map(format));
     }
     if stl::is_stl(head, length) {
         return Ok(Kind::Stl);

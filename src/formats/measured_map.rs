@@ -2,20 +2,46 @@
 
 use std::path::Path;
 
+use regrind_core::geometry::Point;
+
 use super::error::FormatError;
 use super::height_map::MapFormat;
+use super::maps::{alicona, bruker, digital_surf, hdf5, wyko, wyko_ascii, zygo_xyz};
 use super::{metropro, sdf, whole, x3p};
 
 /// All formats of maps. A new format needs its own source file and an entry here.
-const FORMATS: [MapFormat; 3] = [x3p::FORMAT, sdf::FORMAT, metropro::FORMAT];
+const FORMATS: [MapFormat; 10] = [
+    x3p::FORMAT,
+    sdf::FORMAT,
+    metropro::FORMAT,
+    digital_surf::FORMAT,
+    wyko::FORMAT,
+    wyko_ascii::FORMAT,
+    bruker::FORMAT,
+    zygo_xyz::FORMAT,
+    hdf5::FORMAT,
+    alicona::FORMAT,
+];
 
-/// Detects the format of a measured map (X3P, SDF or MetroPro) from `head`, the first bytes of a file. Returns `None`
+/// Detects the format of a measured map from `head`, the first bytes of a file. Returns `None`
 /// for any other file.
 pub(super) fn map_format(head: &[u8]) -> Option<&'static MapFormat> {
     FORMATS.iter().find(|format| (format.begins)(head))
 }
 
-/// Returns true if a file is a map of heights (X3P, SDF or MetroPro), judged by its first bytes.
+/// Parses the content of a map of any format. Returns its measured samples as points in millimetres. `path` only names
+/// the file in messages.
+///
+/// # Errors
+/// Bytes of no known format, or that are not valid; heights that look like marks of samples that were not measured.
+pub fn parse_map(path: &Path, bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
+    let Some(format) = map_format(bytes) else {
+        return Err(FormatError::NoData { path: path.to_owned(), expected: "map of a known format" });
+    };
+    format.parse_points(path, bytes).map(|map| map.points)
+}
+
+/// Returns true if a file is a map of heights, judged by its first bytes.
 ///
 /// # Errors
 /// A file that cannot be read.

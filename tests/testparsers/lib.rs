@@ -21,8 +21,8 @@ use regrind::formats::gcode::{
 };
 use regrind::formats::result::{Content, Coordinates, DecimalMark, check_ended, parse_result};
 use regrind::formats::{
-    HeightMap, LIMIT_MM, Learned, X3pFile, parse_cad, parse_lens, parse_metropro, parse_ply, parse_points, parse_sdf,
-    parse_stl, parse_x3p, read_error_map, references::parse_references,
+    HeightMap, LIMIT_MM, Learned, X3pFile, parse_cad, parse_lens, parse_map, parse_metropro, parse_ply, parse_points,
+    parse_sdf, parse_stl, parse_x3p, read_error_map, references::parse_references,
 };
 use regrind::geometry::{Grid, GridMap, Point};
 use regrind::journal::{Anchor, Reader, RecordKind, canonical_json, verify};
@@ -132,6 +132,13 @@ pub fn lens(bytes: &[u8]) -> bool {
         assert!(found.is_none_or(|(z, gradient)| (z + gradient[0] + gradient[1]).is_finite()));
     }
     true
+}
+
+/// Maps of heights of any format.
+pub fn map(bytes: &[u8]) -> bool {
+    let Ok(points) = parse_map(path(), bytes) else { return false };
+    assert_believable(&points);
+    !points.is_empty()
 }
 
 /// Maps in SDF.

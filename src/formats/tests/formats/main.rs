@@ -2,6 +2,7 @@
 
 mod cad;
 mod headers;
+mod instrument_maps;
 mod lens;
 mod map_files;
 mod points;

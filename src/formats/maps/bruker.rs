@@ -1,0 +1,196 @@
+//! Maps of Bruker (`.opdx`): a tree of named items. The heights are in `/2D_Data/NAME/Matrix`, f32, the top row first,
+//! with the extents and the scale beside it.
+
+use std::path::Path;
+
+use super::super::error::FormatError;
+use super::super::height_map::{HeightMap, MapFormat, check_size};
+use super::{Bytes, length_mm, map_from_top, read_with};
+
+const MAGIC: &[u8] = b"VCA DATA\x01\x00\x00\x55";
+const MAX_DEPTH: usize = 32;
+const MAX_ITEMS: usize = 1_000_000;
+
+/// Format of Bruker, detected by its first bytes.
+pub(in super::super) const FORMAT: MapFormat = MapFormat {
+    begins: |head| head.starts_with(MAGIC),
+    read: |path| read_with(path, parse_bruker),
+    parse: |path, bytes| parse_bruker(path, bytes).map(Into::into),
+};
+
+/// Value of an item that is used.
+enum Value {
+    Text(String),
+    Quantity {
+        value: f64,
+        symbol: String,
+    },
+    /// Matrix of f32: columns, rows, and the first byte.
+    Matrix {
+        size: [usize; 2],
+        begin: usize,
+    },
+}
+
+struct Reader<'a> {
+    file: Bytes<'a>,
+    at: usize,
+    items: Vec<(String, Value)>,
+    count: usize,
+}
+
+fn parse_bruker(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+    let file = Bytes { path, bytes };
+    let mut reader = Reader { file, at: MAGIC.len(), items: Vec::new(), count: 0 };
+    reader.read_items("", bytes.len(), 0)?;
+    let item = |name: &str| reader.items.iter().find(|(path, _)| path == name).map(|(_, value)| value);
+    let text = |name: &str| match item(name) {
+        Some(Value::Text(text)) => Some(text.as_str()),
+        _ => None,
+    };
+    if let Some(kind) = text("/MetaData/DataKind").filter(|kind| *kind != "Surface Height") {
+        return Err(file.unexpected("/MetaData/DataKind", "Surface Height", kind));
+    }
+    let primary = text("/MetaData/PrimaryData2D").unwrap_or("Raw");
+    let name = |key: &str| format!("/2D_Data/{primary}/{key}");
+    let Some(Value::Matrix { size: [columns, rows], begin }) = item(&name("Matrix")) else {
+        return Err(file.unexpected(&name("Matrix"), "a matrix of heights", "none"));
+    };
+    let (columns, rows, begin) = (*columns, *rows, *begin);
+    check_size(path, columns as u64, rows as u64)?;
+    file.slice(begin, 4 * columns * rows)?;
+    let quantity_mm = |key: &str| match item(&name(key)) {
+        Some(Value::Quantity { value, symbol }) => {
+            let unit = length_mm(symbol).ok_or_else(|| file.unexpected(&name(key), "a unit of length", symbol))?;
+            Ok(value * unit)
+        }
+        _ => Err(file.unexpected(&name(key), "a quantity", "none")),
+    };
+    // Extents are from the first sample to the last.
+    let pitch = |extent: f64, count: usize| if count > 1 { extent / (count - 1) as f64 } else { 0.0 };
+    let spacing_mm = [pitch(quantity_mm("Dimension2Extent")?, columns), pitch(quantity_mm("Dimension1Extent")?, rows)];
+    let scale_mm = quantity_mm("DataScale")?;
+    map_from_top(path, [columns, rows], spacing_mm, |index| {
+        let value = f64::from(file.f32(begin + 4 * index).ok()?);
+        (value.abs() < 1e38).then_some(value * scale_mm)
+    })
+}
+
+impl Reader<'_> {
+    /// Reads items up to `end`. `parent` is the path of the container.
+    fn read_items(&mut self, parent: &str, end: usize, depth: usize) -> Result<(), FormatError> {
+        if depth > MAX_DEPTH {
+            return Err(self.file.unexpected(parent, "containers to a depth of 32", "deeper ones"));
+        }
+        while self.at < end {
+            self.count += 1;
+            if self.count > MAX_ITEMS {
+                return Err(self.file.unexpected(parent, "at most 1000000 items", "more"));
+            }
+            let name = format!("{parent}/{}", self.name()?);
+            let kind = self.byte()?;
+            // The end of a container.
+            if kind == 0x7f {
+                self.at = end;
+                return Ok(());
+            }
+            self.read_value(&name, kind, depth)?;
+        }
+        Ok(())
+    }
+
+    fn read_value(&mut self, name: &str, kind: u8, depth: usize) -> Result<(), FormatError> {
+        match kind {
+            0x01 => self.skip(1),
+            0x04 | 0x05 => self.skip(2),
+            0x06 | 0x07 | 0x0c => self.skip(4),
+            0x0a | 0x0b | 0x0d => self.skip(8),
+            0x12 => {
+                let length = self.length()?;
+                let text = self.file.slice(self.at, length)?;
+                self.items.push((name.to_owned(), Value::Text(String::from_utf8_lossy(text).into_owned())));
+                self.skip(length)
+            }
+            0x13 => {
+                let end = self.end()?;
+                let value = self.file.f64(self.at)?;
+                self.at += 8;
+                self.name()?;
+                let symbol = self.name()?;
+                self.items.push((name.to_owned(), Value::Quantity { value, symbol }));
+                self.at = end;
+                Ok(())
+            }
+            0x15 => self.skip(9),
+            0x18 => self.skip_to_end(),
+            0x0e | 0x40 | 0x42 | 0x7c => {
+                self.name()?;
+                self.skip_to_end()
+            }
+            0x00 | 0x45 => {
+                self.name()?;
+                if kind == 0x00 {
+                    self.skip(4)?;
+                    self.name()?;
+                }
+                let end = self.end()?;
+                let [rows, columns] = [self.file.u32(self.at)? as usize, self.file.u32(self.at + 4)? as usize];
+                self.items.push((name.to_owned(), Value::Matrix { size: [columns, rows], begin: self.at + 8 }));
+                self.at = end;
+                Ok(())
+            }
+            0x46 | 0x47 | 0x7d => {
+                let end = self.end()?;
+                self.read_items(name, end, depth + 1)
+            }
+            other => Err(self.file.unexpected(name, "a known type of item", format!("type {other:#04x}"))),
+        }
+    }
+
+    fn byte(&mut self) -> Result<u8, FormatError> {
+        let byte = self.file.slice(self.at, 1)?[0];
+        self.at += 1;
+        Ok(byte)
+    }
+
+    fn skip(&mut self, length: usize) -> Result<(), FormatError> {
+        self.file.slice(self.at, length)?;
+        self.at += length;
+        Ok(())
+    }
+
+    fn name(&mut self) -> Result<String, FormatError> {
+        let length = self.file.u32(self.at)? as usize;
+        let name = self.file.slice(self.at.saturating_add(4), length)?;
+        self.at += 4 + length;
+        Ok(String::from_utf8_lossy(name).into_owned())
+    }
+
+    /// Reads a length, whose own size stands before it.
+    fn length(&mut self) -> Result<usize, FormatError> {
+        let size = self.byte()?;
+        let length = match size {
+            1 => usize::from(self.file.slice(self.at, 1)?[0]),
+            2 => usize::from(self.file.u16(self.at)?),
+            4 => self.file.u32(self.at)? as usize,
+            other => {
+                let place = format!("byte {}", self.at);
+                return Err(self.file.unexpected(&place, "a length of 1, 2 or 4 bytes", other.to_string()));
+            }
+        };
+        self.at += usize::from(size);
+        Ok(length)
+    }
+
+    /// Reads a length, and returns where it ends.
+    fn end(&mut self) -> Result<usize, FormatError> {
+        let length = self.length()?;
+        self.file.slice(self.at, length)?;
+        Ok(self.at + length)
+    }
+
+    fn skip_to_end(&mut self) -> Result<(), FormatError> {
+        self.at = self.end()?;
+        Ok(())
+    }
+}

@@ -1,0 +1,89 @@
+//! Maps that other programs wrote, of one surface: z = (10 i + 4 j) nm with two samples that were not measured.
+
+use std::path::{Path, PathBuf};
+
+use regrind_core::geometry::Point;
+use regrind_formats::{FormatError, NotedPoints, Table, read_measured_with_notes};
+
+fn folder() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/maps")
+}
+
+fn read(path: &Path) -> Result<NotedPoints, FormatError> {
+    read_measured_with_notes(path, &Table::default())
+}
+
+/// Files that are refused, and for what.
+const REFUSED: [(&str, &str); 6] = [
+    ("datx-nounits-not-a-height.datx", "unexpected"),
+    ("datx-lateral-0-not-calibrated.datx", "scale"),
+    ("datx-unit-conflict.datx", "unexpected"),
+    // 4D writes no distance of the samples on the part.
+    ("4d-4sight.h5", "scale"),
+    ("4d-4sight-latest-gzip.h5", "scale"),
+    ("4d-4sightfocus.4D", "scale"),
+];
+
+/// Returns the largest difference from the surface in mm; a constant is taken off if `is_shifted`.
+fn difference(points: &[Point], pitch_y_mm: f64, is_shifted: bool) -> f64 {
+    let expected = |p: &Point| 1e-6 * (10.0 * (p.x / 0.5).round() + 4.0 * (p.y / pitch_y_mm).round());
+    let offs: Vec<f64> = points.iter().map(|p| p.z - expected(p)).collect();
+    let mean = if is_shifted { offs.iter().sum::<f64>() / offs.len() as f64 } else { 0.0 };
+    offs.iter().map(|off| (off - mean).abs()).fold(0.0, f64::max)
+}
+
+#[test]
+fn maps_of_other_writers_match_surface() {
+    let mut wrong = Vec::new();
+    let mut count = 0;
+    for entry in std::fs::read_dir(folder()).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_string_lossy().into_owned();
+        if name == "README.md" || name.contains("no-wavelength") || REFUSED.iter().any(|(file, _)| *file == name) {
+            continue;
+        }
+        count += 1;
+        let read = match read(&path) {
+            Ok(read) => read,
+            Err(error) => {
+                wrong.push(error.to_string());
+                continue;
+            }
+        };
+        let pitch_y_mm = if name.starts_with("zygo") { 0.5 } else { 0.25 };
+        let points = read.points;
+        let is_on_grid = |p: &Point| {
+            let off = |c: f64, pitch: f64| (c / pitch - (c / pitch).round()).abs();
+            off(p.x, 0.5) < 1e-6 && off(p.y, pitch_y_mm) < 1e-6
+        };
+        let missing = [[1.0, pitch_y_mm], [2.5, 3.0 * pitch_y_mm]];
+        let has_missing = points.iter().any(|p| missing.iter().any(|m| (p.x - m[0]).hypot(p.y - m[1]) < 1e-6));
+        // Heights of eight and sixteen bits, and of 32 bits as real numbers, are rounded by their writers.
+        let resolution_mm = match name.as_str() {
+            "opd-int16.opd" => 8e-8,
+            name if name.contains("int8") => 3e-7,
+            name if name.contains("int16") => 2e-9,
+            _ => 1e-11,
+        };
+        let off = difference(&points, pitch_y_mm, name.starts_with("rsciio"));
+        if points.len() != 33 || has_missing || !points.iter().all(is_on_grid) || off > resolution_mm {
+            wrong.push(format!("{name}: {} points, missing ones {has_missing}, off by {off:e} mm", points.len()));
+        }
+    }
+    assert!(wrong.is_empty(), "{wrong:#?}");
+    assert!(count > 50, "{count}");
+}
+
+#[test]
+fn maps_without_scale_or_unit_are_refused() {
+    for (name, why) in REFUSED {
+        let refused = read(&folder().join(name)).unwrap_err();
+        let is_expected = match why {
+            "scale" => matches!(refused, FormatError::NoLateralScale { .. }),
+            _ => matches!(refused, FormatError::Unexpected { .. }),
+        };
+        assert!(is_expected, "{name}: {refused}");
+    }
+    let refused = read(&folder().join("4d-4sight-no-wavelength.h5")).unwrap_err();
+    assert!(matches!(refused, FormatError::Unexpected { .. }), "{refused}");
+}
