@@ -6,6 +6,7 @@ regrind_testcell::program!();
 #[cfg(unix)]
 mod book;
 mod commands;
+mod designs;
 mod first_day;
 mod recipe;
 #[cfg(feature = "pdf")]

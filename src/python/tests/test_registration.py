@@ -1,5 +1,6 @@
 """Registration: recovery of a planted pose, the known zero, layouts of arrays, threads."""
 
+import pathlib
 import threading
 
 import numpy as np
@@ -81,3 +82,14 @@ def test_nominal_from_every_source(tmp_path, nominal, centres):
         assert len(same) == len(nominal)
         found = regrind.register(same, measured, probe_radius=PROBE_RADIUS)
         np.testing.assert_allclose(found.pose, np.eye(4), atol=2e-5)
+
+
+def test_face_of_cad_model_is_nominal():
+    folder = pathlib.Path(__file__).parents[2] / "formats/tests/fixtures/cad"
+    lens = folder / "e-lens-solid-ap242-inch.stp"
+    plane = regrind.Nominal.from_file(lens, face=3, face_frame="face")
+    assert abs(plane.points[:, 2]).max() < 1e-12
+    assert len(regrind.Nominal.from_file(folder / "a-xy-ap214-mm.stp")) > 1000
+    for wrong in [{"face": 9}, {"face": "nothing"}, {"face": 2}, {"face_frame": "part"}]:
+        with pytest.raises(regrind.DataError):
+            regrind.Nominal.from_file(lens, **wrong)

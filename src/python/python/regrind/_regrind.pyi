@@ -269,9 +269,12 @@ class Nominal:
     def __len__(self, /) -> int: ...
     def __repr__(self, /) -> str: ...
     @staticmethod
-    def from_file(path: str | PathLike[str], projection: Literal['auto', 'xy', 'best-fit', 'spherical'] = "auto") -> Nominal:
+    def from_file(path: str | PathLike[str], projection: Literal['auto', 'xy', 'best-fit', 'spherical'] = "auto", *, face: int | str | None = None, face_frame: Literal['file', 'face'] = "file") -> Nominal:
         """
-        Surface in a file: points as text or PLY, a mesh as STL or PLY, or a TOML definition.
+        Surface in a file: points as text or PLY, a mesh as STL or PLY, a CAD model as STEP or IGES, or a TOML definition.
+
+        `face` chooses a face of a CAD model by its number from 1 or by its name; without it, it is the largest.
+        `face_frame` is "file", or "face" for a frame in the middle of the face with z along its outward normal.
 
         Raises DataError with the path, the place and the reason.
         """
