@@ -6,6 +6,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use peak_alloc::PeakAlloc;
 use proptest::prelude::*;
@@ -106,10 +107,18 @@ impl Damage {
     }
 }
 
+/// Returns the number of mutants of one parser: `usual`, or the one that the long run asks for.
+fn cases(usual: u32) -> u32 {
+    std::env::var("REGRIND_MUTANTS").ok().map_or(usual, |count| count.parse().expect("REGRIND_MUTANTS is a number"))
+}
+
+/// Longest time for one mutant. A parser that hangs takes longer, on any machine.
+const MAX_TIME: Duration = Duration::from_secs(10);
+
 macro_rules! survives {
     ($($parser:ident $cases:literal),* $(,)?) => {
         $(proptest! {
-            #![proptest_config(ProptestConfig { cases: $cases, failure_persistence: None, ..ProptestConfig::default() })]
+            #![proptest_config(ProptestConfig { cases: cases($cases), failure_persistence: None, ..ProptestConfig::default() })]
 
             #[test]
             fn $parser(
@@ -120,8 +129,10 @@ macro_rules! survives {
                 let samples = samples(stringify!($parser));
                 let mut bytes = samples[which.index(samples.len())].1.clone();
                 damage.iter().for_each(|damage| damage.to(&mut bytes));
+                let began = Instant::now();
                 parsers::$parser(&bytes);
                 parsers::$parser(&noise);
+                prop_assert!(began.elapsed() < MAX_TIME, "{:?}", began.elapsed());
                 prop_assert!(MEMORY.peak_usage_as_mb() < MAX_MEMORY_MB as f32, "{} MB", MEMORY.peak_usage_as_mb());
             }
         })*
