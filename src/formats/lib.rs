@@ -37,6 +37,7 @@ pub mod registration;
 pub mod result;
 mod result_content;
 pub mod run_files;
+mod scanner_cloud;
 pub mod sdf;
 pub mod stl;
 mod system;
@@ -78,6 +79,7 @@ pub use registration::{
     DeviationRow, read_deviations, sync_folder, try_writing, write_atomic, write_column, write_deviations,
     write_json_atomic, write_points, write_private,
 };
+pub use scanner_cloud::parse_scanner_cloud;
 pub use sdf::{parse_sdf, read_sdf};
 pub use stl::{StlFile, parse_stl, read_stl};
 pub use system::{OpenToOthers, is_same_file, readable_by_others, user_name};
@@ -93,6 +95,7 @@ use layout::is_separator_line;
 use lens::lens_format;
 use measured_map::map_format;
 use regrind_core::geometry::Point;
+use scanner_cloud::{CloudFormat, cloud_format, parse_cloud};
 
 /// Format of a file, detected by its content.
 enum Kind {
@@ -102,6 +105,7 @@ enum Kind {
     Toml,
     Cad,
     Lens,
+    Cloud(CloudFormat),
     Map(&'static MapFormat),
 }
 
@@ -140,7 +144,14 @@ pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result
         Kind::Toml => wrong("a TOML file", "give the definition as the nominal"),
         Kind::Cad => wrong("a CAD model", "give the model as the nominal"),
         Kind::Lens => wrong("a lens", "give the lens as the nominal"),
-        Kind::Map(format) => format.read_points(path).map(|map| map.points.into()),
+        Kind::Cloud(format) => {
+            let bytes = whole::open(path)?.read_all(path, whole::MAX_BYTES)?;
+            parse_cloud(path, &bytes, format, table.unit).map(Into::into)
+        }
+        Kind::Map(format) => format.read_points(path).map(|map| {
+            let note = |note| PointNote::Map { path: path.to_owned(), note };
+            NotedPoints { points: map.points, notes: map.notes.into_iter().map(note).collect() }
+        }),
     }
 }
 
@@ -161,7 +172,9 @@ pub fn read_plan(path: impl AsRef<Path>, table: &Table) -> Result<Vec<Point>, Fo
 /// Rejects a file of the format `kind` if `table` gives columns or a unit and the format is not a table of text. Other
 /// formats state their coordinates themselves.
 fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatError> {
-    if matches!(kind, Kind::Text) || *table == Table::default() {
+    // A cloud tells by itself whether it needs a unit.
+    let of_cloud = matches!(kind, Kind::Cloud(_)) && table.columns.is_none() && table.height_unit.is_none();
+    if matches!(kind, Kind::Text) || of_cloud || *table == Table::default() {
         return Ok(());
     }
     Err(FormatError::WrongKind {
@@ -183,6 +196,9 @@ fn kind(path: &Path) -> Result<Kind, FormatError> {
     // Some maps begin with a line of text, which other readers refuse by name.
     if let Some(format) = map_format(head) {
         return Ok(Kind::Map(format));
+    }
+    if let Some(format) = cloud_format(head) {
+        return Ok(Kind::Cloud(format));
     }
     if cad_format(head).is_some() {
         return Ok(Kind::Cad);

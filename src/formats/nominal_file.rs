@@ -149,6 +149,14 @@ pub fn read_nominal_as(path: impl AsRef<Path>, table: &Table) -> Result<NominalF
         }
         Kind::Cad => NominalFile::Faces(read_cad(path)?),
         Kind::Lens => NominalFile::Lens(read_lens(path)?),
+        Kind::Cloud(_) => {
+            return Err(FormatError::WrongKind {
+                path: path.to_owned(),
+                expected: "a nominal surface as points, mesh or definition",
+                found: "the points of a scanner",
+                remedy: "give them as the measurement",
+            });
+        }
         Kind::Map(_) => {
             return Err(FormatError::WrongKind {
                 path: path.to_owned(),

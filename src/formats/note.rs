@@ -49,6 +49,13 @@ pub enum PointNote {
         /// Value that was read.
         value_mm: f64,
     },
+    /// A map has content that can be read in more than one way.
+    Map {
+        /// The file.
+        path: PathBuf,
+        /// How it was read.
+        note: String,
+    },
 }
 
 impl fmt::Display for PointNote {
@@ -71,6 +78,7 @@ impl fmt::Display for PointNote {
                     ),
                 }
             }
+            Self::Map { path, note } => write!(f, "{}: {note}", path.display()),
             Self::OneThousandsMark { path, line, found, value_mm } => write!(
                 f,
                 "{}, line {line}: `{found}` was read as {value_mm} mm, and no other number of the file has a \

@@ -22,7 +22,7 @@ use regrind::formats::gcode::{
 use regrind::formats::result::{Content, Coordinates, DecimalMark, check_ended, parse_result};
 use regrind::formats::{
     HeightMap, LIMIT_MM, Learned, X3pFile, parse_cad, parse_lens, parse_map, parse_metropro, parse_ply, parse_points,
-    parse_sdf, parse_stl, parse_x3p, read_error_map, references::parse_references,
+    parse_scanner_cloud, parse_sdf, parse_stl, parse_x3p, read_error_map, references::parse_references,
 };
 use regrind::geometry::{Grid, GridMap, Point};
 use regrind::journal::{Anchor, Reader, RecordKind, canonical_json, verify};
@@ -136,7 +136,7 @@ pub fn lens(bytes: &[u8]) -> bool {
 
 /// Maps of heights of any format.
 pub fn map(bytes: &[u8]) -> bool {
-    let Ok(points) = parse_map(path(), bytes) else { return false };
+    let Ok(points) = parse_map(path(), bytes).or_else(|_| parse_scanner_cloud(path(), bytes)) else { return false };
     assert_believable(&points);
     !points.is_empty()
 }

@@ -87,3 +87,41 @@ fn maps_without_scale_or_unit_are_refused() {
     let refused = read(&folder().join("4d-4sight-no-wavelength.h5")).unwrap_err();
     assert!(matches!(refused, FormatError::Unexpected { .. }), "{refused}");
 }
+
+/// Scanner points of the same surface, in metres.
+#[test]
+fn scanner_points_match_surface() {
+    let unit = Table { unit: Some("m".parse().unwrap()), ..Table::default() };
+    let cases: [(&str, &Table, usize); 4] = [
+        ("pye57-identity.e57", &Table::default(), 33),
+        ("pye57-invalid-state.e57", &Table::default(), 33),
+        ("laspy.las", &unit, 33),
+        // The first point is withheld.
+        ("laspy-14-withheld.las", &unit, 32),
+    ];
+    for (name, table, count) in cases {
+        let read =
+            read_measured_with_notes(scanner_folder().join(name), table).unwrap_or_else(|error| panic!("{error}"));
+        assert_eq!(read.points.len(), count, "{name}");
+        let off = difference(&read.points, 0.25, false);
+        // LAS has integers of 0.1 nm.
+        assert!(off < 1e-7, "{name}: {off:e}");
+    }
+    // The pose of a scan: a quarter turn about z, and a shift by 1, 2 and 3 m.
+    let identity = read(&scanner_folder().join("pye57-identity.e57")).unwrap().points;
+    let posed = read(&scanner_folder().join("pye57-pose.e57")).unwrap().points;
+    for (p, q) in identity.iter().zip(&posed) {
+        let expected = Point::new(1000.0 - p.y, 2000.0 + p.x, 3000.0 + p.z);
+        assert!((expected - q).norm() < 1e-9, "{q} instead of {expected}");
+    }
+    let refused = read(&scanner_folder().join("laspy.las"));
+    assert!(matches!(refused, Err(FormatError::Unexpected { .. })), "LAS has no unit");
+    let packed = read_measured_with_notes(scanner_folder().join("laspy.laz"), &unit);
+    assert!(matches!(packed, Err(FormatError::Unexpected { .. })), "LAZ is not read");
+    let refused = read_measured_with_notes(scanner_folder().join("pye57-identity.e57"), &unit);
+    assert!(matches!(refused, Err(FormatError::Unexpected { .. })), "E57 has one");
+}
+
+fn scanner_folder() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/scanner")
+}

@@ -1,0 +1,125 @@
+//! Clouds of points of scanners: E57 (ASTM E2807) and LAS (ASPRS).
+//!
+//! E57 is in metres. Each scan has a pose, which is applied; points that the file calls invalid are left out. LAS states
+//! no unit, so it must be given; points that the file withholds or calls noise are left out.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use regrind_core::geometry::Point;
+
+use super::error::{FormatError, excerpt};
+use super::number::is_believable;
+use super::unit::Unit;
+
+/// Maximum number of points that are read.
+const MAX_POINTS: u64 = 50_000_000;
+
+/// Format of a cloud, detected by its first bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum CloudFormat {
+    E57,
+    Las,
+}
+
+/// Returns the format of a cloud from its first bytes; `None` for another file.
+pub(super) fn cloud_format(head: &[u8]) -> Option<CloudFormat> {
+    if head.starts_with(b"ASTM-E57") {
+        return Some(CloudFormat::E57);
+    }
+    head.starts_with(b"LASF").then_some(CloudFormat::Las)
+}
+
+/// Parses the content of a cloud. Returns its points in millimetres. `unit` is that of a LAS file. `path` only names the
+/// file in messages.
+///
+/// # Errors
+/// Bytes that are not valid in their format; a LAS file without a given unit, or an E57 file with one; a coordinate beyond
+/// 1e7 mm; no valid point.
+pub(super) fn parse_cloud(
+    path: &Path,
+    bytes: &[u8],
+    format: CloudFormat,
+    unit: Option<Unit>,
+) -> Result<Vec<Point>, FormatError> {
+    let unexpected = |place: &str, expected: &str, found: &str| FormatError::Unexpected {
+        path: path.to_owned(),
+        place: place.to_owned(),
+        expected: expected.to_owned(),
+        found: excerpt(found.as_bytes()),
+    };
+    let points = match (format, unit) {
+        (CloudFormat::E57, None) => e57_points(bytes).map_err(|error| unexpected("file", "E57", &error))?,
+        (CloudFormat::E57, Some(_)) => return Err(unexpected("unit", "no unit, because E57 is in metres", "one")),
+        (CloudFormat::Las, Some(unit)) => {
+            let points = las_points(bytes).map_err(|error| unexpected("file", "LAS", &error))?;
+            points.into_iter().map(|p| p * unit.in_mm()).collect()
+        }
+        (CloudFormat::Las, None) => {
+            return Err(unexpected("unit", "a unit, such as --unit m, because LAS states none", "none"));
+        }
+    };
+    if points.is_empty() {
+        return Err(FormatError::NoData { path: path.to_owned(), expected: "valid point" });
+    }
+    if let Some(at) = points.iter().position(|p| !p.iter().all(|c| is_believable(*c))) {
+        return Err(unexpected(
+            &format!("point {}", at + 1),
+            "coordinates of at most 1e7 mm",
+            &format!("{}", points[at]),
+        ));
+    }
+    Ok(points)
+}
+
+/// Returns the valid points of all scans, in millimetres.
+fn e57_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
+    let words = |error: e57::Error| error.to_string();
+    let mut file = e57::E57Reader::new(Cursor::new(bytes)).map_err(words)?;
+    let mut points = Vec::new();
+    for scan in file.pointclouds() {
+        if scan.records.saturating_add(points.len() as u64) > MAX_POINTS {
+            return Err(format!("more than {MAX_POINTS} points"));
+        }
+        for point in file.pointcloud_simple(&scan).map_err(words)? {
+            if let e57::CartesianCoordinate::Valid { x, y, z } = point.map_err(words)?.cartesian {
+                points.push(Point::new(x, y, z) * 1e3);
+            }
+        }
+    }
+    Ok(points)
+}
+
+/// Returns the points that are neither withheld nor noise, in the unit of the file.
+fn las_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
+    let words = |error: las::Error| error.to_string();
+    let mut file = las::Reader::new(Cursor::new(bytes.to_vec())).map_err(words)?;
+    let count = file.header().number_of_points();
+    // A point takes twenty bytes.
+    if count > MAX_POINTS || count > bytes.len() as u64 / 20 {
+        return Err(format!("{count} points in {} bytes", bytes.len()));
+    }
+    let all = file.read_all().map_err(words)?;
+    let mut points = Vec::new();
+    for point in all.points() {
+        let point = point.map_err(words)?;
+        let is_noise = matches!(u8::from(point.classification), 7 | 18);
+        if !point.is_withheld && !is_noise {
+            points.push(Point::new(point.x, point.y, point.z));
+        }
+    }
+    Ok(points)
+}
+
+/// Parses the content of a cloud of any format, LAS in metres. Returns its points in millimetres. `path` only names the
+/// file in messages.
+///
+/// # Errors
+/// The same as for reading such a file.
+pub fn parse_scanner_cloud(path: &Path, bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
+    let Some(format) = cloud_format(bytes) else {
+        return Err(FormatError::NoData { path: path.to_owned(), expected: "cloud of a known format" });
+    };
+    let unit = (format == CloudFormat::Las).then_some(Unit::Metre);
+    parse_cloud(path, bytes, format, unit)
+}
