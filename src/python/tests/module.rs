@@ -14,7 +14,10 @@ fn python_package_passes_its_tests() {
     let python = std::env::var_os("REGRIND_NUMPY_PYTHON").expect("REGRIND_NUMPY_PYTHON names a Python with numpy");
     let package = Path::new(env!("CARGO_MANIFEST_DIR"));
     let scratch = tempfile::tempdir().unwrap();
-    let folder = scratch.path();
+    // The folders lie beside each other as in the sources, because a test reads the files of another crate's tests.
+    let folder = &scratch.path().join("python");
+    let of_formats = "formats/tests/fixtures/cad";
+    copy(&package.join("..").join(of_formats), &scratch.path().join(of_formats));
     copy(&package.join("python/regrind"), &folder.join("regrind"));
     copy(&package.join("tests"), &folder.join("tests"));
     copy(&package.join("notebooks"), &folder.join("notebooks"));
