@@ -20,6 +20,9 @@ const CONTINUATION: f64 = 0.3;
 /// Number of places that are tried for one (x, y), the nearest first.
 const TRIES: u32 = 6;
 
+/// Largest step of Newton's method, as a share of the size of the part, that can be due to rounding.
+const MAX_ROUNDING: f64 = 1e-9;
+
 /// Smallest z of a unit normal that counts as facing +z.
 const MIN_NORMAL_Z: f64 = 1e-6;
 
@@ -129,6 +132,7 @@ impl HeightField {
     /// on the side of du x dv.
     fn solve_height(&self, x: f64, y: f64, start: f64) -> Option<(f64, Vector)> {
         let mut z = start;
+        let mut last_step = f64::INFINITY;
         for _ in 0..60 {
             let (value, normal) = self.implicit(&Point::new(x, y, z))?;
             if normal.z == 0.0 {
@@ -137,7 +141,11 @@ impl HeightField {
             // A step of more than the size of the part leaves a place that is nearly vertical.
             let step = (value / normal.z).clamp(-self.scale_mm, self.scale_mm);
             z -= step;
-            if step.abs() <= 4.0 * f64::EPSILON * self.scale_mm {
+            // The distance from a far centre is rounded more coarsely than the size of the part suggests: the steps end
+            // where they no longer become smaller.
+            let is_rounding = step.abs() >= last_step && last_step <= MAX_ROUNDING * self.scale_mm;
+            last_step = step.abs();
+            if is_rounding || step.abs() <= 4.0 * f64::EPSILON * self.scale_mm {
                 let (_, normal) = self.implicit(&Point::new(x, y, z))?;
                 return Some((z, normal));
             }
@@ -304,4 +312,41 @@ fn start_parameters(surface: &ParametricSurface, k: usize, [low, high]: [f64; 2]
 fn continued([low, high]: [f64; 2]) -> [f64; 2] {
     let beyond = CONTINUATION * (high - low);
     [low - beyond, high + beyond]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A sphere with the centre (0, 0, R) has the sag R - sqrt(R^2 - r^2) = r^2 / (R + sqrt(R^2 - r^2)). The distance
+    /// from the centre of a large sphere is rounded more coarsely than the size of the part suggests.
+    #[test]
+    fn large_spheres_have_height_everywhere() {
+        for radius_mm in [13.0, 50.0, 200.0, 333.3, 500.0, 1000.0, 1e4, 12_345.678, 1e5] {
+            // The poles lie far from the part.
+            let frame =
+                Frame { origin: Point::new(0.0, 0.0, radius_mm), axes: [Vector::y(), Vector::z(), Vector::x()] };
+            let surface = ParametricSurface::Sphere { frame, radius_mm };
+            let sag = |x: f64, y: f64| {
+                let square = x * x + y * y;
+                square / (radius_mm + (radius_mm * radius_mm - square).sqrt())
+            };
+            let outline = (0..64).map(|k| {
+                let (sine, cosine) = (f64::from(k) * std::f64::consts::TAU / 64.0).sin_cos();
+                let [x, y] = [12.5 * cosine, 12.5 * sine];
+                Point::new(x, y, sag(x, y))
+            });
+            let field = HeightField::new(surface, &[outline.collect()], -1.0).unwrap();
+            for i in 0..400 {
+                let (sine, cosine) = (f64::from(i) * 2.4).sin_cos();
+                let r = 12.4 * (f64::from(i) / 400.0).sqrt();
+                let (x, y) = (r * cosine, r * sine);
+                let (z, slope) = field.sag_and_gradient(x, y).unwrap_or_else(|| panic!("R {radius_mm} at {x}, {y}"));
+                let limit = 8.0 * f64::EPSILON * (radius_mm + 100.0);
+                assert!((z - sag(x, y)).abs() <= limit, "R {radius_mm} at {x}, {y}: {z}");
+                let steepness = x / (radius_mm * radius_mm - r * r).sqrt();
+                assert!((slope[0] - steepness).abs() <= 1e-12 * (1.0 + steepness.abs()), "R {radius_mm} at {x}, {y}");
+            }
+        }
+    }
 }
