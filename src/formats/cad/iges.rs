@@ -600,7 +600,8 @@ impl<'a> Reader<'a> {
 /// Gives pieces of a curve numbers by which they are joined. Two pieces along the same places in opposite senses are one
 /// edge, a seam. Ends that are nearly at one place are one vertex.
 fn as_edges(pieces: Vec<Vec<Point>>) -> Vec<EdgePlaces> {
-    let size = pieces.iter().flatten().fold(0.0, |size: f64, p| size.max((p - pieces[0][0]).norm()));
+    let Some(first) = pieces.iter().flatten().next().copied() else { return Vec::new() };
+    let size = pieces.iter().flatten().fold(0.0, |size: f64, p| size.max((p - first).norm()));
     let near = |a: &Point, b: &Point| (a - b).norm() <= 1e-4 * size;
     let mut vertices: Vec<Point> = Vec::new();
     let mut edges: Vec<EdgePlaces> = Vec::new();
@@ -654,5 +655,20 @@ fn kind_in_words(kind: u64) -> &'static str {
         196 => "sphere",
         198 => "torus",
         _ => "surface",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A curve without places in a composite curve is no edge.
+    #[test]
+    fn empty_piece_of_curve_is_left_out() {
+        let line = vec![Point::new(0.0, 0.0, 0.0), Point::new(1.0, 0.0, 0.0)];
+        let edges = as_edges(vec![Vec::new(), line.clone()]);
+        assert_eq!(edges.len(), 1);
+        assert_eq!((edges[0].ends, &edges[0].places), ([0, 1], &line));
+        assert!(as_edges(vec![Vec::new(), Vec::new()]).is_empty());
     }
 }

@@ -34,6 +34,9 @@ struct Block {
     special: BTreeMap<String, f64>,
     circle: Option<f64>,
     rectangle: [Option<f64>; 2],
+    aperture_centre: [f64; 2],
+    /// Keyword of an aperture that is an ellipse, or turned.
+    unknown_aperture: Option<String>,
 }
 
 /// Reads the surfaces of a lens.
@@ -160,7 +163,11 @@ impl Reader<'_> {
                 return Ok(());
             }
             "RDM" => {
-                self.has_radii = Some(statement.word(1) != "NO");
+                self.has_radii = match statement.word(1).as_str() {
+                    "" | "Y" | "YES" => Some(true),
+                    "N" | "NO" => Some(false),
+                    _ => return Err(statement.wrong("RDM, RDM YES or RDM NO")),
+                };
                 return Ok(());
             }
             _ => {}
@@ -230,6 +237,11 @@ impl Block {
             "CIR" if statement.is_number(at) => self.circle = Some(statement.value(at)?),
             "REX" if statement.is_number(at) => self.rectangle[0] = Some(statement.value(at)?),
             "REY" if statement.is_number(at) => self.rectangle[1] = Some(statement.value(at)?),
+            "ADX" if statement.is_number(at) => self.aperture_centre[0] = statement.value(at)?,
+            "ADY" if statement.is_number(at) => self.aperture_centre[1] = statement.value(at)?,
+            "ARO" if !statement.is_number(at) || statement.value(at)? == 0.0 => {}
+            // No outline of ours is an ellipse or turned.
+            "ELX" | "ELY" | "ARO" => self.unknown_aperture = Some(keyword.to_owned()),
             letter => {
                 if let Some(k) = LETTERS.iter().position(|known| *known == letter) {
                     self.letters.insert(k, statement.value(at)?);
@@ -253,7 +265,12 @@ impl Block {
             surface: match (unit_mm, curvature) {
                 (None, _) => Err("the file has no unit; add a statement DIM".to_owned()),
                 (_, Err(reason)) => Err(reason),
-                (Some(unit), Ok(curvature)) => self.built(curvature, unit),
+                (Some(unit), Ok(curvature)) => match &self.unknown_aperture {
+                    Some(keyword) => Err(format!(
+                        "its aperture ({keyword}) is an ellipse or turned; remove the statement and give --aperture"
+                    )),
+                    None => self.built(curvature, unit),
+                },
             },
         }
     }
@@ -275,11 +292,12 @@ impl Block {
     }
 
     fn aperture(&self, unit: f64) -> Option<Aperture> {
+        let centre_mm = self.aperture_centre.map(|coordinate| coordinate * unit);
         let aperture = match (self.rectangle, self.circle) {
             ([Some(x), Some(y)], _) => {
-                Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 2.0 * x * unit, height_mm: 2.0 * y * unit }
+                Aperture::Rectangle { centre_mm, width_mm: 2.0 * x * unit, height_mm: 2.0 * y * unit }
             }
-            (_, Some(radius)) => Aperture::Circle { centre_mm: [0.0; 2], radius_mm: radius * unit },
+            (_, Some(radius)) => Aperture::Circle { centre_mm, radius_mm: radius * unit },
             _ => return None,
         };
         aperture.validate().is_ok().then_some(aperture)

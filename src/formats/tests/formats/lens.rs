@@ -117,7 +117,46 @@ fn damaged_lens_files_are_refused() {
     let codev = std::fs::read_to_string(folder().join("CV-SPH-mm.seq")).unwrap();
     let silent = parse_lens(path, codev.replace("RDM", "TITLE 'x'").as_bytes()).unwrap();
     assert!(matches!(silent.choose(Some(&SurfaceChoice::Number(1))), Err(ChoiceError::Unreadable { .. })));
+    assert!(parse_lens(path, codev.replace("RDM", "RDM MAYBE").as_bytes()).is_err());
     let unitless = parse_lens(path, codev.replace("DIM", "DUM").as_bytes()).unwrap();
     assert!(matches!(unitless.choose(Some(&SurfaceChoice::Number(1))), Err(ChoiceError::Unreadable { .. })));
     assert!(parse_lens(path, codev.replace("DIM   M", "DIM   F").as_bytes()).is_err());
+}
+
+/// `RDM N` and `RDM NO` say that the numbers of S are curvatures, as lens files of others are written.
+#[test]
+fn short_words_of_code_v_are_read() {
+    let text = std::fs::read_to_string(folder().join("CV-SPH-mm.seq")).unwrap();
+    let sag = |text: &str| {
+        let lens = parse_lens(Path::new("a.seq"), text.as_bytes()).unwrap();
+        lens.choose(Some(&SurfaceChoice::Number(1))).map(|found| found.surface.as_ref().unwrap().sag(1.0, 2.0))
+    };
+    let radius: f64 = {
+        let line = text.lines().find(|line| line.starts_with("S ")).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse().unwrap()
+    };
+    let curvature = text.replace(&format!("S     {radius}"), &format!("S {:e}", 1.0 / radius));
+    let expected = sag(&text).unwrap().unwrap();
+    for word in ["N", "NO", "n"] {
+        let found = sag(&curvature.replacen("RDM", &format!("RDM {word}"), 1)).unwrap().unwrap();
+        assert!((found - expected).abs() < 1e-13, "{word}: {found} instead of {expected}");
+    }
+    assert_eq!(sag(&text.replacen("RDM", "RDM Y", 1)).unwrap(), Some(expected));
+}
+
+/// `ADX` and `ADY` move the aperture of a surface; an outline that is turned or an ellipse is not known.
+#[test]
+fn aperture_of_code_v_is_moved() {
+    let text = std::fs::read_to_string(folder().join("CV-SPH-mm.seq")).unwrap();
+    let with = |statements: &str| text.replacen("  STO", &format!("  STO\n  {statements}"), 1);
+    let aperture = |statements: &str| {
+        let lens = parse_lens(Path::new("a.seq"), with(statements).as_bytes()).unwrap();
+        lens.choose(Some(&SurfaceChoice::Number(1))).map(|found| found.aperture.clone()).ok()
+    };
+    let moved = Aperture::Rectangle { centre_mm: [0.0, 9.5], width_mm: 6.0, height_mm: 8.0 };
+    assert_eq!(aperture("REX 3; REY 4; ADY 9.5; ARO 0"), Some(Some(moved)));
+    let moved = Aperture::Circle { centre_mm: [-2.0, 0.0], radius_mm: 3.0 };
+    assert_eq!(aperture("CIR 3; ADX -2"), Some(Some(moved)));
+    assert_eq!(aperture("REX 3; REY 4; ARO 30"), None);
+    assert_eq!(aperture("ELX 3; ELY 4"), None);
 }
