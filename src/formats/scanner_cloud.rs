@@ -72,6 +72,22 @@ pub(super) fn parse_cloud(
     Ok(points)
 }
 
+/// Largest difference of the length of a quaternion from 1. Writers round its parts to seven digits and fewer.
+const MAX_QUATERNION_ERROR: f64 = 1e-3;
+
+/// Returns the factor by which the library scales the points of a scan when it turns them, and the point in metres that
+/// stays where it is. The factor is the square of the length of the quaternion, which rounding makes differ from 1.
+fn scale_of_pose(pose: Option<&e57::Transform>) -> Result<(f64, Point), String> {
+    let Some(pose) = pose else { return Ok((1.0, Point::origin())) };
+    let q = &pose.rotation;
+    let scale = q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z;
+    let length = scale.sqrt();
+    if length.is_nan() || (length - 1.0).abs() > MAX_QUATERNION_ERROR {
+        return Err(format!("a pose whose quaternion has the length {length} instead of 1"));
+    }
+    Ok((scale, Point::new(pose.translation.x, pose.translation.y, pose.translation.z)))
+}
+
 /// Returns the valid points of all scans, in millimetres.
 fn e57_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
     let words = |error: e57::Error| error.to_string();
@@ -81,9 +97,10 @@ fn e57_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
         if scan.records.saturating_add(points.len() as u64) > MAX_POINTS {
             return Err(format!("more than {MAX_POINTS} points"));
         }
+        let (scale, origin) = scale_of_pose(scan.transform.as_ref())?;
         for point in file.pointcloud_simple(&scan).map_err(words)? {
             if let e57::CartesianCoordinate::Valid { x, y, z } = point.map_err(words)?.cartesian {
-                points.push(Point::new(x, y, z) * 1e3);
+                points.push((origin + (Point::new(x, y, z) - origin) / scale) * 1e3);
             }
         }
     }
@@ -95,8 +112,8 @@ fn las_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
     let words = |error: las::Error| error.to_string();
     let mut file = las::Reader::new(Cursor::new(bytes.to_vec())).map_err(words)?;
     let count = file.header().number_of_points();
-    // A point takes twenty bytes.
-    if count > MAX_POINTS || count > bytes.len() as u64 / 20 {
+    let record = u64::from(file.header().point_format().len());
+    if count > MAX_POINTS || count.saturating_mul(record) > bytes.len() as u64 {
         return Err(format!("{count} points in {} bytes", bytes.len()));
     }
     let all = file.read_all().map_err(words)?;
@@ -122,4 +139,24 @@ pub fn parse_scanner_cloud(path: &Path, bytes: &[u8]) -> Result<Vec<Point>, Form
     };
     let unit = (format == CloudFormat::Las).then_some(Unit::Metre);
     parse_cloud(path, bytes, format, unit)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A part that is rounded by 2e-8 makes a scale of 1 + 2 * 0.6 * 2e-8. A length of 1.2 is no rounding.
+    #[test]
+    fn scale_of_rounded_quaternion_is_square_of_length() {
+        let pose = |w: f64| e57::Transform {
+            rotation: e57::Quaternion { w, x: 0.0, y: 0.0, z: 0.8 },
+            translation: e57::Translation { x: 1.0, y: 2.0, z: 3.0 },
+        };
+        let (scale, origin) = scale_of_pose(Some(&pose(0.600_000_02))).unwrap();
+        assert!((scale - 1.000_000_024).abs() < 1e-14, "{scale}");
+        assert_eq!(origin, Point::new(1.0, 2.0, 3.0));
+        assert_eq!(scale_of_pose(None).unwrap().0, 1.0);
+        assert!(scale_of_pose(Some(&pose(0.9))).is_err());
+        assert!(scale_of_pose(Some(&pose(f64::NAN))).is_err());
+    }
 }
