@@ -320,8 +320,9 @@ impl<'a> Reader<'a> {
         let origin = self.parameters_of_number(location)?.point()? * self.unit_mm;
         let kind = taken.entry.kind;
         let sphere_radius = if kind == 196 { taken.number()? } else { 0.0 };
-        let axis = taken.pointer()?;
-        let z = self.direction(axis)?.unwrap_or_else(Vector::z);
+        // A sphere without parametrisation ends with its radius.
+        let has_axis = kind != 196 || taken.entry.form == 1;
+        let z = if has_axis { self.direction(taken.pointer()?)? } else { None }.unwrap_or_else(Vector::z);
         let radius = if matches!(kind, 190 | 196) { sphere_radius } else { taken.number()? } * self.unit_mm;
         let second = if matches!(kind, 194 | 198) { taken.number()? } else { 0.0 };
         let reference = if taken.entry.form == 1 { self.direction(taken.pointer()?)? } else { None };
@@ -619,9 +620,11 @@ fn as_edges(pieces: Vec<Vec<Point>>) -> Vec<EdgePlaces> {
         if ends[0] == ends[1] && places.iter().all(|p| near(p, &last)) {
             continue;
         }
-        let middle = places[places.len() / 2];
         let same = edges.iter().find(|edge| {
-            edge.ends == [ends[1], ends[0]] && edge.places.iter().any(|p| near(p, &middle)) && ends[0] != ends[1]
+            let run_back = edge.ends == [ends[1], ends[0]] && ends[0] != ends[1];
+            // An arc and its chord have the same ends, too.
+            let along = |of: &[Point], on: &[Point]| distance_from_line(&middle(of), on) <= 1e-4 * size;
+            run_back && along(&places, &edge.places) && along(&edge.places, &places)
         });
         let edge = same.map_or(edges.len() as u64, |edge| edge.edge);
         edges.push(EdgePlaces { edge, ends, places });
@@ -658,9 +661,51 @@ fn kind_in_words(kind: u64) -> &'static str {
     }
 }
 
+/// Returns a place near the middle of a line of at least two places that is none of its ends.
+fn middle(places: &[Point]) -> Point {
+    match places {
+        [a, b] => nalgebra::center(a, b),
+        _ => places[places.len() / 2],
+    }
+}
+
+/// Returns the distance of `p` from the straight segments between places.
+fn distance_from_line(p: &Point, places: &[Point]) -> f64 {
+    let from_segment = |pair: &[Point]| {
+        let along = pair[1] - pair[0];
+        let share = (p - pair[0]).dot(&along) / along.norm_squared();
+        // A segment without length is its first place.
+        let share = if share.is_finite() { share.clamp(0.0, 1.0) } else { 0.0 };
+        (p - (pair[0] + along * share)).norm()
+    };
+    places.windows(2).map(from_segment).fold(f64::INFINITY, f64::min)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A half circle and its chord enclose a face. A line that is passed in both senses is a seam.
+    #[test]
+    fn arc_and_chord_are_no_seam() {
+        let arc: Vec<Point> = (0..=20)
+            .map(|k| {
+                let (sine, cosine) = (f64::from(k) * std::f64::consts::PI / 20.0).sin_cos();
+                Point::new(10.0 * cosine, 10.0 * sine, 0.0)
+            })
+            .collect();
+        let chord = vec![arc[20], arc[0]];
+        for pieces in [vec![arc.clone(), chord.clone()], vec![chord.clone(), arc.clone()]] {
+            let edges = as_edges(pieces);
+            assert_ne!(edges[0].edge, edges[1].edge);
+            assert_eq!(joined_outlines(edges).unwrap().len(), 1);
+        }
+        for line in [chord, arc] {
+            let back: Vec<Point> = line.iter().rev().copied().collect();
+            let edges = as_edges(vec![line, back]);
+            assert_eq!(edges[0].edge, edges[1].edge);
+        }
+    }
 
     /// A curve without places in a composite curve is no edge.
     #[test]

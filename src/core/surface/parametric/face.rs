@@ -361,6 +361,11 @@ fn simple_aperture(outline: &[[f64; 2]]) -> Aperture {
     Aperture::Polygon { corners_mm: without_needless(outline) }
 }
 
+/// Largest distance of the middle of an edge of an outline from the circle of its ends: a part in mm that the outline's
+/// own tolerance explains, and a share of the radius for outlines with as many places as they may have.
+const MAX_SAGITTA_MM: f64 = 2.0 * OUTLINE_TOLERANCE_MM;
+const MAX_SAGITTA: f64 = 1e-5;
+
 /// Returns centre and radius of an outline that is a circle.
 fn circle(outline: &[[f64; 2]]) -> Option<([f64; 2], f64)> {
     const LEAST: usize = 12;
@@ -375,9 +380,12 @@ fn circle(outline: &[[f64; 2]]) -> Option<([f64; 2], f64)> {
     let centre = [a[0] + (cy * bb - by * cc) / area, a[1] + (bx * cc - cx * bb) / area];
     let radius = (a[0] - centre[0]).hypot(a[1] - centre[1]);
     let fits = outline.iter().all(|p| ((p[0] - centre[0]).hypot(p[1] - centre[1]) - radius).abs() <= RECOGNITION_MM);
-    // The places of a polygon can lie on a circle too; those of a circle are near each other.
+    // The corners of a polygon can lie on a circle, and so can the ends of a flat: the middles of the edges must too.
     let next = outline.iter().skip(1).chain(outline.first());
-    let dense = outline.iter().zip(next).all(|(p, q)| (p[0] - q[0]).hypot(p[1] - q[1]) < 0.6 * radius);
+    let dense = outline.iter().zip(next).all(|(p, q)| {
+        let middle = (0.5 * (p[0] + q[0]) - centre[0]).hypot(0.5 * (p[1] + q[1]) - centre[1]);
+        radius - middle <= MAX_SAGITTA_MM + MAX_SAGITTA * radius
+    });
     (fits && dense && radius.is_finite()).then(|| (centre.map(rounded), rounded(radius)))
 }
 
@@ -407,4 +415,34 @@ fn without_needless(outline: &[[f64; 2]]) -> Vec<[f64; 2]> {
         cross.abs() > 1e-7 * (c[0] - a[0]).hypot(c[1] - a[1])
     };
     (0..count).filter(|&i| is_needed(i)).map(|i| kept[i]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Returns places on a circle of radius 50 mm around (3, -2) mm, from one angle to another.
+    fn arc(from: f64, to: f64, count: usize) -> Vec<[f64; 2]> {
+        let place = |k: usize| {
+            let (sine, cosine) = (from + (to - from) * k as f64 / count as f64).sin_cos();
+            [3.0 + 50.0 * cosine, -2.0 + 50.0 * sine]
+        };
+        (0..count).map(place).collect()
+    }
+
+    #[test]
+    fn circle_is_told_from_polygon_and_flat() {
+        const TURN: f64 = std::f64::consts::TAU;
+        assert_eq!(circle(&arc(0.0, TURN, 512)), Some(([3.0, -2.0], 50.0)));
+        // Corners on the circle are no circle.
+        assert_eq!(circle(&arc(0.0, TURN, 12)), None);
+        assert_eq!(circle(&arc(0.0, TURN, 60)), None);
+        // A flat of 29 mm and one of 5 mm: only their ends lie on the outline. The flat of 5 mm is 0.06 mm deep.
+        for half in [0.294, 0.05] {
+            let mut with_flat = arc(half, TURN - half, 512);
+            let (sine, cosine) = (TURN - half).sin_cos();
+            with_flat.push([3.0 + 50.0 * cosine, -2.0 + 50.0 * sine]);
+            assert_eq!(circle(&with_flat), None, "{half}");
+        }
+    }
 }
