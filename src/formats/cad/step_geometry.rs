@@ -339,7 +339,7 @@ impl<'a> Geometry<'a> {
             },
             "SURFACE_OF_REVOLUTION" => {
                 let (origin, axis) = self.axis(entity.reference(2)?)?;
-                ParametricSurface::Revolution { profile: self.profile(entity.reference(1)?)?, origin, axis }
+                ParametricSurface::revolution(self.profile(entity.reference(1)?)?, origin, axis)
             }
             "SURFACE_OF_LINEAR_EXTRUSION" => ParametricSurface::Extrusion {
                 profile: self.profile(entity.reference(1)?)?,

@@ -87,6 +87,20 @@ impl Curve {
         }
     }
 
+    /// Returns the length after which the parameter repeats; infinite for a curve that is not closed.
+    pub(super) fn period(&self) -> f64 {
+        match self {
+            Self::Ellipse { .. } => std::f64::consts::TAU,
+            Self::Part { whole, ends: [low, high] } if high - low >= whole.period() * (1.0 - 1e-12) => whole.period(),
+            Self::BSpline(curve) => {
+                let [low, high] = curve.knots().domain();
+                let [first, middle, last] = [low, 0.5 * (low + high), high].map(|t| curve.evaluate(t).0);
+                if (first - last).norm() <= 1e-9 * (first - middle).norm() { high - low } else { f64::INFINITY }
+            }
+            _ => f64::INFINITY,
+        }
+    }
+
     /// Returns the parameter of the point of the curve that is nearest to `p`.
     pub fn parameter_near(&self, p: &Point) -> f64 {
         match self {

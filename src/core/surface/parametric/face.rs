@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use nalgebra::Matrix3;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -24,6 +25,9 @@ const PATCHES: usize = 160;
 
 /// Largest distance in mm from a circle or from an axis-parallel line at which an outline counts as one.
 const RECOGNITION_MM: f64 = 1e-5;
+
+/// Smallest z of the mean normal of a face that faces +z or -z.
+const MIN_UP: f64 = 1e-3;
 
 /// Face of a CAD model.
 #[derive(Clone, Debug, PartialEq)]
@@ -48,7 +52,9 @@ pub enum FaceFrame {
     #[default]
     File,
     /// A frame with its origin on the face, in the middle of its outline, and z along the outward normal there. The
-    /// smallest rotation leads to it from the frame of the file.
+    /// smallest rotation leads to it from the frame of the file; for a normal along -z, half a turn about x and the
+    /// smallest rotation after it. If the file does not say which side is outside, it is the one that faces +z of the
+    /// file.
     Face,
 }
 
@@ -73,6 +79,13 @@ pub enum FaceError {
         .normal[0], .normal[1], .normal[2]
     )]
     FacesAway { normal: [f64; 3] },
+    /// The file does not say which side is outside, and neither side faces +z of the file.
+    #[error(
+        "the file does not say on which side of the face the material is, and the face stands vertical: its normal is \
+         about ({:.3}, {:.3}, {:.3}); export it as a face of a solid, or turn it so that its outside faces +z",
+        .normal[0], .normal[1], .normal[2]
+    )]
+    UnknownOutside { normal: [f64; 3] },
     /// Somewhere the face stands vertical, or hangs over.
     #[error(
         "the face is vertical, or hangs over, near ({x_mm:.3} mm, {y_mm:.3} mm) of its frame; give an outline that \
@@ -208,7 +221,7 @@ impl Face {
         let up = surface_from_file.transform_direction(&normal);
         let faces_away = || FaceError::FacesAway { normal: normal.into() };
         // With an outside that is known, the normal tells which way the face looks.
-        if self.normal_points_out.is_some() && up.z <= 0.0 || up.z.abs() < 1e-3 {
+        if self.normal_points_out.is_some() && up.z <= 0.0 || up.z.abs() < MIN_UP {
             return Err(faces_away());
         }
         let side = self.side().unwrap_or(if up.z < 0.0 { -1.0 } else { 1.0 });
@@ -221,16 +234,22 @@ impl Face {
 
     /// Returns the pose that transforms the face's own frame to that of the file.
     fn own_frame(&self) -> Result<Pose, FaceError> {
-        let normal = self.mean_normal().ok_or(FaceError::NoArea)?;
+        let mut normal = self.mean_normal().ok_or(FaceError::NoArea)?;
+        if self.normal_points_out.is_none() {
+            if normal.z.abs() < MIN_UP {
+                return Err(FaceError::UnknownOutside { normal: normal.into() });
+            }
+            normal *= normal.z.signum();
+        }
         // About the middle of the outline, and then on the surface there.
-        let rough = Pose { rotation: min_rotation(&normal), translation_mm: self.centre().coords };
+        let rough = Pose { rotation: own_rotation(&normal), translation_mm: self.centre().coords };
         let field = self.height_field(&rough)?;
         let bounds = self.flat_bounds(&rough);
         let [x, y] = [0, 1].map(|k| 0.5 * (bounds[0][k] + bounds[1][k]));
         let (z, [gx, gy]) = field.sag_and_gradient(x, y).ok_or(FaceError::Overhang { x_mm: x, y_mm: y })?;
         let normal = rough.transform_direction(&Vector::new(-gx, -gy, 1.0).normalize());
         let origin = rough.transform_point(&Point::new(x, y, z));
-        Ok(Pose { rotation: min_rotation(&normal), translation_mm: origin.coords })
+        Ok(Pose { rotation: own_rotation(&normal), translation_mm: origin.coords })
     }
 
     /// Returns the mean of the places of the outer outline.
@@ -298,19 +317,33 @@ impl Face {
     }
 
     /// Returns small patches of the surface over ranges of u and v, those that the outlines enclose.
-    fn patches(&self, [u, v]: [[f64; 2]; 2], trimmed: &TrimmedDomain) -> impl Iterator<Item = SmallPatch> {
+    fn patches<'a>(
+        &'a self,
+        [u, v]: [[f64; 2]; 2],
+        trimmed: &'a TrimmedDomain,
+    ) -> impl Iterator<Item = SmallPatch> + 'a {
         let place = |[low, high]: [f64; 2], i: usize| low + (high - low) * (i as f64 + 0.5) / PATCHES as f64;
         let cell = (u[1] - u[0]) * (v[1] - v[0]) / (PATCHES * PATCHES) as f64;
-        let patch = move |u: f64, v: f64| {
+        let patch = move |at: [f64; 2]| {
+            let [u, v] = trimmed.wrapped(at);
             let found = self.surface.evaluate(u, v);
             let area = found.area_vector();
-            SmallPatch { at: [u, v], point: found.point, normal: area, area_mm2: area.norm() * cell }
+            SmallPatch { at, point: found.point, normal: area, area_mm2: area.norm() * cell }
         };
-        (0..PATCHES).flat_map(move |i| {
-            let (u, column) = (place(u, i), trimmed.column(place(u, i)));
-            (0..PATCHES).map(move |j| place(v, j)).filter(move |&v| column.contains(v)).map(move |v| patch(u, v))
-        })
+        let places = |bounds: [f64; 2]| (0..PATCHES).map(|i| place(bounds, i)).collect();
+        trimmed.enclosed(places(u), places(v)).map(patch)
     }
+}
+
+/// Returns the rotation that maps z to `normal`, a vector of length 1.
+fn own_rotation(normal: &Vector) -> Matrix3<f64> {
+    // Near -z the axis of the smallest rotation would be left to rounding.
+    const NEARLY_OPPOSITE: f64 = -0.999;
+    if normal.z > NEARLY_OPPOSITE {
+        return min_rotation(normal);
+    }
+    let half_turn = Matrix3::from_diagonal(&Vector::new(1.0, -1.0, -1.0));
+    half_turn * min_rotation(&(half_turn * normal))
 }
 
 /// Small part of a surface.
@@ -419,6 +452,8 @@ fn without_needless(outline: &[[f64; 2]]) -> Vec<[f64; 2]> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::curve::Curve;
+    use super::super::frame::Frame;
     use super::*;
 
     /// Returns places on a circle of radius 50 mm around (3, -2) mm, from one angle to another.
@@ -428,6 +463,86 @@ mod tests {
             [3.0 + 50.0 * cosine, -2.0 + 50.0 * sine]
         };
         (0..count).map(place).collect()
+    }
+
+    fn ring(count: usize, place: impl Fn(f64) -> Point) -> Vec<Point> {
+        (0..count).map(|k| place(k as f64 * std::f64::consts::TAU / count as f64)).collect()
+    }
+
+    fn on_axes(axes: [Vector; 3]) -> Frame {
+        Frame { origin: Point::origin(), axes }
+    }
+
+    fn face(surface: ParametricSurface, outlines: Vec<Vec<Point>>) -> Face {
+        Face { name: String::new(), surface, normal_points_out: Some(true), outlines }
+    }
+
+    /// Areas by hand of faces whose outlines go around the surface in every way.
+    #[test]
+    fn areas_of_faces_that_go_around() {
+        let pi = std::f64::consts::PI;
+        let standard = on_axes([Vector::x(), Vector::y(), Vector::z()]);
+        let level = |radius: f64, z: f64| ring(200, |t| Point::new(radius * t.cos(), radius * t.sin(), z));
+        let near = |face: &Face, area: f64, name: &str| {
+            let found = face.area_mm2();
+            assert!((found / area - 1.0).abs() < 0.02, "{name}: {found} instead of {area}");
+        };
+        // A cone to its apex: only its rim is an outline. The slant is 5 for a height of 4 and a radius of 3.
+        let cone = ParametricSurface::Cone { frame: standard, radius_mm: 3.0, half_angle_rad: 0.75f64.atan() };
+        near(&face(cone, vec![level(3.0, 0.0)]), pi * 3.0 * 5.0, "cone");
+        let line = Curve::Line { origin: Point::new(3.0, 0.0, 0.0), direction: Vector::new(3.0, 0.0, 4.0) };
+        let turned = ParametricSurface::revolution(line, Point::origin(), Vector::z());
+        near(&face(turned, vec![level(3.0, 0.0)]), pi * 3.0 * 5.0, "turned line");
+        // A paraboloid z = r^2 / 4f: area 8 pi f^2 / 3 ((1 + r^2 / 4f^2)^1.5 - 1).
+        let vertex = on_axes([Vector::z(), Vector::x(), Vector::y()]);
+        let parabola = Curve::Parabola { frame: vertex, focal_mm: 10.0 };
+        let paraboloid = ParametricSurface::revolution(parabola, Point::origin(), Vector::z());
+        let area = 8.0 * pi * 100.0 / 3.0 * (1.25f64.powf(1.5) - 1.0);
+        near(&face(paraboloid, vec![level(10.0, 2.5)]), area, "paraboloid");
+        // A band of a sphere of radius 10, made by a circle around its axis: 2 pi r h.
+        let circle = |frame: Frame| Curve::Ellipse { frame, semi_axes_mm: [10.0, 10.0] };
+        for (x, y) in [(Vector::x(), Vector::z()), (Vector::z(), Vector::x()), (-Vector::z(), -Vector::x())] {
+            let sphere =
+                ParametricSurface::revolution(circle(on_axes([x, y, x.cross(&y)])), Point::origin(), Vector::z());
+            let rings = vec![level(91.0f64.sqrt(), -3.0), level(96.0f64.sqrt(), -2.0)];
+            near(&face(sphere, rings), 2.0 * pi * 10.0, "band of a sphere");
+        }
+        // A quarter of the tube of a torus, between two rings: 2 pi (R r pi / 2 + r^2 (sin b - sin a)).
+        let torus = ParametricSurface::Torus { frame: standard, major_radius_mm: 10.0, minor_radius_mm: 2.0 };
+        let fillet = face(torus.clone(), vec![level(12.0, 0.0), level(10.0, 2.0)]);
+        near(&fillet, 2.0 * pi * (10.0 * 2.0 * pi / 2.0 + 4.0), "fillet");
+        // A bend of a pipe: two rings around the tube, a quarter of a turn from each other.
+        let around_tube = |u: f64| ring(200, |v| torus.evaluate(u, v).point);
+        let bend = face(torus.clone(), vec![around_tube(0.3), around_tube(0.3 + pi / 2.0)]);
+        near(&bend, pi * pi * 2.0 * 10.0, "bend");
+        // A strip of an elliptic cylinder over the place where its profile begins.
+        let ellipse = Curve::Ellipse { frame: standard, semi_axes_mm: [10.0, 10.0] };
+        let tube = ParametricSurface::Extrusion { profile: ellipse, direction: Vector::z() };
+        let at = |u: f64, z: f64| Point::new(10.0 * u.cos(), 10.0 * u.sin(), z);
+        let side = |from: [f64; 2], to: [f64; 2]| {
+            (0..20).map(move |k| {
+                let share = f64::from(k) / 20.0;
+                at(from[0] + share * (to[0] - from[0]), from[1] + share * (to[1] - from[1]))
+            })
+        };
+        let corners = [[-0.3, 0.0], [0.2, 0.0], [0.2, 7.0], [-0.3, 7.0]];
+        let strip = (0..4).flat_map(|k| side(corners[k], corners[(k + 1) % 4])).collect();
+        near(&face(tube, vec![strip]), 0.5 * 10.0 * 7.0, "strip");
+    }
+
+    /// Rounding of a normal along -z does not turn the frame about it.
+    #[test]
+    fn frame_of_underside_is_half_turn_about_x() {
+        let half_turn = Matrix3::from_diagonal(&Vector::new(1.0, -1.0, -1.0));
+        for (x, y) in [(0.0, 0.0), (1e-14, 0.0), (-1e-14, 0.0), (0.0, 1e-14), (1e-9, -1e-9)] {
+            let normal = Vector::new(x, y, -1.0).normalize();
+            let found = own_rotation(&normal);
+            assert!((found - half_turn).amax() < 2e-9, "{x}, {y}");
+            assert!((found.column(2) - normal).amax() < 1e-15);
+        }
+        let normal = Vector::new(0.03, -0.02, -0.99935).normalize();
+        let found = own_rotation(&normal);
+        assert!((found * Vector::z() - normal).amax() < 1e-15 && (found.determinant() - 1.0).abs() < 1e-14);
     }
 
     #[test]

@@ -4,7 +4,7 @@ use super::bspline::SurfacePoint;
 use super::curve::Curve;
 use super::frame::Frame;
 use super::parametric_surface::{ParametricSurface, has_planar_profile, meridian};
-use super::trimmed_domain::TrimmedDomain;
+use super::trimmed_domain::{TrimmedDomain, wrapped};
 use crate::geometry::{Point, PointTree, Vector};
 
 /// Largest number of places per direction from which the search can start.
@@ -38,6 +38,8 @@ pub struct HeightField {
     starts: Vec<([f64; 2], f64)>,
     tree: PointTree,
     domain: [[f64; 2]; 2],
+    /// Lengths after which u and v repeat; infinite for a parameter that does not.
+    period: [f64; 2],
     /// Largest coordinate, for the limits of rounding.
     scale_mm: f64,
 }
@@ -56,14 +58,11 @@ impl HeightField {
     /// Returns `None` if no place of the part faces +z.
     pub(super) fn new(surface: ParametricSurface, outlines: &[Vec<Point>], side: f64) -> Option<Self> {
         let (trimmed, domain) = TrimmedDomain::of_outlines(&surface, outlines);
-        let border: Vec<[f64; 2]> = trimmed.border_places().collect();
+        let border: Vec<[f64; 2]> = trimmed.border_places().map(|at| trimmed.wrapped(at)).collect();
         // A ring on a sphere has two sides, of which one faces +z.
         let trimmed = if trimmed.is_ambiguous() { trimmed.everything() } else { trimmed };
         let [us, vs] = [0, 1].map(|k| start_parameters(&surface, k, trimmed.bounds(domain)[k]));
-        let inside = us.iter().flat_map(|&u| {
-            let column = trimmed.column(u);
-            vs.iter().filter(move |&&v| column.contains(v)).map(move |&v| [u, v])
-        });
+        let inside = trimmed.enclosed(us, vs).map(|at| trimmed.wrapped(at));
         let mut field = Self {
             is_planar_profile: has_planar_profile(&surface),
             surface,
@@ -71,6 +70,7 @@ impl HeightField {
             starts: Vec::new(),
             tree: PointTree::new([].into_iter()),
             domain,
+            period: trimmed.period,
             scale_mm: outlines.iter().flatten().fold(1e-3, |scale: f64, p| scale.max(p.coords.amax())),
         };
         let mut places = Vec::new();
@@ -85,7 +85,8 @@ impl HeightField {
             }
         }
         if matches!(field.surface, ParametricSurface::BSpline(_)) {
-            field.domain = domain.map(continued);
+            let open = |k: usize| field.period[k].is_infinite();
+            field.domain = [0, 1].map(|k| if open(k) { continued(domain[k]) } else { domain[k] });
         }
         field.tree = PointTree::new(places.into_iter());
         (!field.starts.is_empty()).then_some(field)
@@ -249,10 +250,11 @@ impl HeightField {
         Some((found.point.z + slope[0] * rest[0] + slope[1] * rest[1], normal))
     }
 
-    /// Keeps a parameter of a B-spline within its continued domain.
+    /// Keeps a parameter of a B-spline within its continued domain; where the surface is closed, by whole turns.
     fn within(&self, k: usize, t: f64) -> f64 {
         if matches!(self.surface, ParametricSurface::BSpline(_)) {
-            t.clamp(self.domain[k][0], self.domain[k][1])
+            let [low, high] = self.domain[k];
+            wrapped(t, [low, high], self.period[k]).clamp(low, high)
         } else {
             t
         }

@@ -174,6 +174,43 @@ impl ParametricSurface {
     }
 }
 
+impl ParametricSurface {
+    /// Creates the surface that a profile makes as it turns about an axis. A whole ellipse around a point of the axis is
+    /// cut where it crosses the axis, because its other half would make the same surface again.
+    ///
+    /// Lengths are in millimetres; `axis` has the length 1.
+    pub fn revolution(profile: Curve, origin: Point, axis: Vector) -> Self {
+        let profile = match first_half(&profile, &origin, &axis) {
+            Some(ends) => profile.part(ends),
+            None => profile,
+        };
+        Self::Revolution { profile, origin, axis }
+    }
+
+    /// Returns v of the place where the surface meets its axis, if that is an end that no outline shows: the apex of a
+    /// cone, or of a turned line, parabola or hyperbola.
+    pub(super) fn apex(&self) -> Option<f64> {
+        match self {
+            Self::Cone { radius_mm, half_angle_rad, .. } => Some(-radius_mm / half_angle_rad.tan()),
+            Self::Revolution { profile, origin, axis } if profile.domain().is_none() => {
+                let out = meridian(profile, origin, axis)?;
+                match profile {
+                    Curve::Line { origin: start, direction } => {
+                        let slope = direction.dot(&out);
+                        (slope.abs() > 1e-9 * direction.norm()).then(|| (origin - start).dot(&out) / slope)
+                    }
+                    _ => {
+                        let vertex = profile.evaluate(0.0).0 - origin;
+                        let off = vertex - axis * vertex.dot(axis);
+                        (off.norm() <= 1e-9 * (1.0 + vertex.norm())).then_some(0.0)
+                    }
+                }
+            }
+            _ => None,
+        }
+    }
+}
+
 impl SurfacePoint {
     /// Returns du x dv, which is as long as the area that a unit of (u, v) has.
     pub fn area_vector(&self) -> Vector {
@@ -254,6 +291,21 @@ pub(super) fn meridian(profile: &Curve, origin: &Point, axis: &Vector) -> Option
     };
     let farthest = (0..=16).map(out).max_by(|a, b| a.norm().total_cmp(&b.norm()))?;
     farthest.try_normalize(1e-12)
+}
+
+/// Returns the parameters between which an ellipse lies on one side of an axis through its centre: from 0 on, or around
+/// 0. Returns `None` for another curve, and for an ellipse that is not in a plane with the axis.
+fn first_half(profile: &Curve, origin: &Point, axis: &Vector) -> Option<[f64; 2]> {
+    let Curve::Ellipse { frame, semi_axes_mm } = profile else { return None };
+    let across = |d: Vector| d - axis * d.dot(axis);
+    let is_centred = across(frame.origin - origin).norm() <= 1e-9 * semi_axes_mm[0].max(semi_axes_mm[1]);
+    let out = [0, 1].into_iter().find_map(|k| across(frame.axes[k]).try_normalize(1e-6))?;
+    let is_planar = frame.axes[2].dot(&out).abs().max(frame.axes[2].dot(axis).abs()) <= 1e-9;
+    // The distance from the axis is c cos(t - phase).
+    let [x, y] = [0, 1].map(|k| semi_axes_mm[k] * frame.axes[k].dot(&out));
+    let phase = y.atan2(x);
+    let quarter = std::f64::consts::FRAC_PI_2;
+    (is_centred && is_planar).then_some([phase - quarter, phase + quarter])
 }
 
 /// Tells whether the profile of a surface of revolution lies in a plane with the axis.
@@ -356,6 +408,45 @@ pub(super) mod tests {
         assert!(close(torus.evaluate(1.0, 0.0).principal_curvatures(), [-0.5, -1.0 / 9.0]));
         let pole = sphere.evaluate(0.0, std::f64::consts::FRAC_PI_2);
         assert!(pole.area_vector().norm() < 1e-14);
+    }
+
+    /// The half of an ellipse on one side of the axis makes the whole ellipsoid; a tube is made by the whole circle.
+    #[test]
+    fn ellipse_around_axis_is_halved() {
+        let (origin, axis) = (Point::new(1.0, 2.0, 3.0), Vector::z());
+        let ellipse = |x: Vector, offset: f64| Curve::Ellipse {
+            frame: Frame::new(origin + Vector::x() * offset, Vector::y(), x).unwrap(),
+            semi_axes_mm: [5.0, 3.0],
+        };
+        let ends = |profile: Curve| {
+            let ParametricSurface::Revolution { profile, .. } = ParametricSurface::revolution(profile, origin, axis)
+            else {
+                return None;
+            };
+            profile.domain()
+        };
+        let (quarter, turn) = (std::f64::consts::FRAC_PI_2, std::f64::consts::TAU);
+        let close = |found: Option<[f64; 2]>, expected: [f64; 2]| {
+            let found = found.unwrap();
+            (found[0] - expected[0]).abs() < 1e-12 && (found[1] - expected[1]).abs() < 1e-12
+        };
+        assert!(close(ends(ellipse(Vector::x(), 0.0)), [-quarter, quarter]));
+        assert!(close(ends(ellipse(Vector::z(), 0.0)), [0.0, 2.0 * quarter]));
+        assert!(close(ends(ellipse(Vector::x(), 9.0)), [0.0, turn]));
+    }
+
+    #[test]
+    fn apex_is_where_surface_meets_axis() {
+        let z = ParametricSurface::Cone { frame: frame(), radius_mm: 5.0, half_angle_rad: 0.4 };
+        let apex = z.evaluate(0.7, z.apex().unwrap()).point;
+        assert!((apex - frame().origin).cross(&frame().axes[2]).norm() < 1e-12);
+        let line = Curve::Line { origin: Point::new(4.0, 0.0, 1.0), direction: Vector::new(-2.0, 0.0, 0.5) };
+        let turned = ParametricSurface::revolution(line, Point::origin(), Vector::z());
+        assert!((turned.evaluate(0.3, turned.apex().unwrap()).point - Point::new(0.0, 0.0, 2.0)).norm() < 1e-14);
+        let vertex = Frame::new(Point::new(0.0, 0.0, 1.0), Vector::y(), Vector::z()).unwrap();
+        let parabola = Curve::Parabola { frame: vertex, focal_mm: 30.0 };
+        assert_eq!(ParametricSurface::revolution(parabola, Point::origin(), Vector::z()).apex(), Some(0.0));
+        assert_eq!(kinds()[1].apex(), None);
     }
 
     #[test]

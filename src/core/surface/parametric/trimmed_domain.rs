@@ -9,8 +9,15 @@ const STARTS: usize = 32;
 /// Outlines in (u, v).
 pub(super) struct TrimmedDomain {
     outlines: Vec<Vec<[f64; 2]>>,
+    /// Ranges of u and v.
+    domain: [[f64; 2]; 2],
     /// Lengths after which u and v repeat; infinite for a parameter that does not.
-    period: [f64; 2],
+    pub(super) period: [f64; 2],
+    /// Middle of the ranges in which the outlines lie.
+    middle: [f64; 2],
+    /// The parameter that a scan line keeps constant: 0 for u, 1 for v. It is the one around which outlines go, because
+    /// a line along it does not cross them.
+    constant: usize,
     /// True if the places beyond the outlines are meant: with an odd number of outlines that go around once.
     is_inverted: bool,
 }
@@ -19,8 +26,14 @@ impl TrimmedDomain {
     /// Maps outlines in space to (u, v). Returns the domain around them too.
     pub(super) fn of_outlines(surface: &ParametricSurface, outlines: &[Vec<Point>]) -> (Self, [[f64; 2]; 2]) {
         let places: Vec<Point> = outlines.iter().flatten().copied().collect();
-        let domain = surface.domain_near(&places);
-        (Self::new(surface, domain, outlines), domain)
+        let mut domain = surface.domain_near(&places);
+        let mut trimmed = Self::new(surface, domain, outlines);
+        // One ring on a cone encloses its apex, which no outline has.
+        if let (true, Some(apex)) = (trimmed.is_ambiguous(), surface.apex()) {
+            domain[1] = range(domain[1].into_iter().chain([apex]));
+            trimmed.domain = domain;
+        }
+        (trimmed, domain)
     }
 
     /// Maps outlines in space to (u, v). `domain` has the ranges of u and v.
@@ -35,7 +48,31 @@ impl TrimmedDomain {
             }
             places
         });
-        Self { outlines: mapped.collect(), period, is_inverted: false }
+        let mut mapped: Vec<Vec<[f64; 2]>> = mapped.collect();
+        // All of them in the turn of the first.
+        let centre = |outline: &[[f64; 2]], k: usize| middle(range(outline.iter().map(|place| place[k])));
+        if let Some((first, others)) = mapped.split_first_mut() {
+            for outline in others {
+                let shift = [0, 1].map(|k| {
+                    let at = centre(outline, k);
+                    unwrapped(at, centre(first, k), period[k]) - at
+                });
+                outline.iter_mut().for_each(|place| *place = [0, 1].map(|k| place[k] + shift[k]));
+            }
+        }
+        let middle = [0, 1].map(|k| middle(range(mapped.iter().flatten().map(|place| place[k]))));
+        let mut trimmed = Self { outlines: mapped, domain, period, middle, constant: 0, is_inverted: false };
+        trimmed.constant = usize::from(trimmed.goes_around(1) && !trimmed.goes_around(0));
+        trimmed
+    }
+
+    /// Tells whether an outline goes around the parameter `k`.
+    fn goes_around(&self, k: usize) -> bool {
+        self.outlines.iter().any(|outline| self.is_ring(outline, k))
+    }
+
+    fn is_ring(&self, outline: &[[f64; 2]], k: usize) -> bool {
+        (outline[0][k] - outline[outline.len() - 1][k]).abs() > 0.5 * self.period[k]
     }
 
     /// Returns the places of the outlines in (u, v).
@@ -43,16 +80,15 @@ impl TrimmedDomain {
         self.outlines.iter().flatten().copied()
     }
 
+    /// Returns a place moved by whole periods into the domain.
+    pub(super) fn wrapped(&self, at: [f64; 2]) -> [f64; 2] {
+        [0, 1].map(|k| wrapped(at[k], self.domain[k], self.period[k]))
+    }
+
     /// Returns the ranges of u and v in which the enclosed places lie. A parameter around which an outline goes has its
     /// whole range.
     pub(super) fn bounds(&self, domain: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
-        let goes_around = |k: usize| {
-            self.outlines.iter().any(|outline| {
-                let [first, last] = [outline[0], outline[outline.len() - 1]];
-                (first[k] - last[k]).abs() > 0.5 * self.period[k]
-            })
-        };
-        if self.outlines.is_empty() || self.is_inverted || goes_around(0) || goes_around(1) {
+        if self.outlines.is_empty() || self.is_inverted || self.goes_around(0) || self.goes_around(1) {
             return domain;
         }
         [0, 1].map(|k| range(self.border_places().map(|place| place[k])))
@@ -70,47 +106,49 @@ impl TrimmedDomain {
 
     /// Tells whether one outline, and no other, goes around the surface: then the sides of it cannot be told apart.
     pub(super) fn is_ambiguous(&self) -> bool {
-        let around = |outline: &&Vec<[f64; 2]>| {
-            let [first, last] = [outline[0], outline[outline.len() - 1]];
-            (first[0] - last[0]).abs() > 0.5 * self.period[0]
-        };
-        self.outlines.iter().filter(around).count() % 2 == 1
+        self.outlines.iter().filter(|outline| self.is_ring(outline, self.constant)).count() % 2 == 1
     }
 
-    /// Returns where the outlines cross the line of constant `u`.
-    pub(super) fn column(&self, u: f64) -> Column<'_> {
+    /// Returns those places (u, v) of a grid that the outlines enclose.
+    pub(super) fn enclosed(&self, us: Vec<f64>, vs: Vec<f64>) -> impl Iterator<Item = [f64; 2]> {
+        let [lines, along] = if self.constant == 0 { [us, vs] } else { [vs, us] };
+        lines.into_iter().flat_map(move |line| {
+            let crossings = self.crossings(line);
+            let inside: Vec<f64> = along.iter().copied().filter(|&at| self.contains(&crossings, at)).collect();
+            inside.into_iter().map(move |at| if self.constant == 0 { [line, at] } else { [at, line] })
+        })
+    }
+
+    /// Returns where the outlines cross the line on which the constant parameter is `line`.
+    fn crossings(&self, line: f64) -> Vec<f64> {
+        let (k, other) = (self.constant, 1 - self.constant);
         let mut crossings = Vec::new();
         for outline in &self.outlines {
-            let [low, high] = range(outline.iter().map(|place| place[1]));
             let next = outline.iter().skip(1).chain(outline.first());
-            for ([ua, va], [ub, vb]) in outline.iter().zip(next) {
+            for (a, b) in outline.iter().zip(next) {
                 // The last edge goes back to the first place, which can be a turn away.
-                let ub = unwrapped(*ub, *ua, self.period[0]);
-                let u = unwrapped(u, 0.5 * (ua + ub), self.period[0]);
-                if (*ua > u) != (ub > u) {
-                    crossings.push([va + (u - ua) / (ub - ua) * (vb - va), 0.5 * (low + high)]);
+                let end = [0, 1].map(|i| unwrapped(b[i], a[i], self.period[i]));
+                let line = unwrapped(line, 0.5 * (a[k] + end[k]), self.period[k]);
+                if (a[k] > line) != (end[k] > line) {
+                    crossings.push(a[other] + (line - a[k]) / (end[k] - a[k]) * (end[other] - a[other]));
                 }
             }
         }
-        Column { domain: self, crossings }
+        crossings
+    }
+
+    /// Tells whether the outlines enclose the place `at` of a scan line, by the number of their edges beyond it.
+    fn contains(&self, crossings: &[f64], at: f64) -> bool {
+        let other = 1 - self.constant;
+        // Where the parameter repeats, the turn in which the outlines lie.
+        let at = unwrapped(at, self.middle[other], self.period[other]);
+        let beyond = crossings.iter().filter(|crossing| at < **crossing).count();
+        self.outlines.is_empty() || (beyond % 2 == 1) != self.is_inverted
     }
 }
 
-/// Places of a domain with one u.
-pub(super) struct Column<'a> {
-    domain: &'a TrimmedDomain,
-    /// v of each crossing, and v of the middle of its outline.
-    crossings: Vec<[f64; 2]>,
-}
-
-impl Column<'_> {
-    /// Tells whether the outlines enclose the place with this `v`, by the number of their edges beyond it.
-    pub(super) fn contains(&self, v: f64) -> bool {
-        let TrimmedDomain { outlines, period, is_inverted } = self.domain;
-        // Where v repeats too, the turn of v in which the outline lies.
-        let beyond = self.crossings.iter().filter(|[crossing, middle]| unwrapped(v, *middle, period[1]) < *crossing);
-        outlines.is_empty() || (beyond.count() % 2 == 1) != *is_inverted
-    }
+fn middle([low, high]: [f64; 2]) -> f64 {
+    0.5 * (low + high)
 }
 
 /// Returns `t` moved by whole periods to where it is nearest to `near`.
@@ -118,11 +156,18 @@ fn unwrapped(t: f64, near: f64, period: f64) -> f64 {
     if period.is_finite() { t + ((near - t) / period).round() * period } else { t }
 }
 
+/// Returns `t` moved by whole periods into its range, if it lies outside.
+pub(super) fn wrapped(t: f64, [low, high]: [f64; 2], period: f64) -> f64 {
+    if period.is_finite() && !(low..=high).contains(&t) { low + (t - low).rem_euclid(period) } else { t }
+}
+
 /// Returns the lengths after which the parameters repeat.
-pub(super) fn period(surface: &ParametricSurface, [u, v]: [[f64; 2]; 2]) -> [f64; 2] {
+fn period(surface: &ParametricSurface, [u, v]: [[f64; 2]; 2]) -> [f64; 2] {
     let turn = std::f64::consts::TAU;
     match surface {
-        ParametricSurface::Plane { .. } | ParametricSurface::Extrusion { .. } => [f64::INFINITY; 2],
+        ParametricSurface::Plane { .. } => [f64::INFINITY; 2],
+        ParametricSurface::Extrusion { profile, .. } => [profile.period(), f64::INFINITY],
+        ParametricSurface::Revolution { profile, .. } => [turn, profile.period()],
         ParametricSurface::Torus { .. } => [turn; 2],
         ParametricSurface::BSpline(_) => {
             let place = |u: f64, v: f64| surface.evaluate(u, v).point;
