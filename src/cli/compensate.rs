@@ -173,7 +173,7 @@ const LEVEL_OFF_NODES: f64 = 5.0;
 ///
 /// Returns an error if the file cannot be read, or if the surface cannot be written as a height z = f(x, y).
 fn ground(file: &std::path::Path, table: &NominalTable) -> Result<TargetSurface, Failure> {
-    let surface = nominal::surface(file, PlaneProjection::Auto, table)?;
+    let (surface, _) = nominal::surface(file, PlaneProjection::Auto, table)?;
     let failed = |source| Failure::Path { path: file.to_owned(), source };
     let (field, _) = nominal_height_field(&surface).map_err(failed)?;
     let grid = Grid { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [1.0; 2] };

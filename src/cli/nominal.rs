@@ -93,14 +93,20 @@ pub(super) fn read(path: &Path, projection: PlaneProjection, table: &Table) -> R
 
 /// Reads the nominal file `path` and builds the nominal surface. `projection` selects the projection of a point cloud
 /// to two coordinates. `given` has the columns and the units of a table of points whose header does not state them, and
-/// the face of a CAD model.
+/// the face of a CAD model. Returns which of several surfaces it is too, in words.
 ///
 /// # Errors
 /// Returns the errors of [`read`]. Also returns an error with the file name if no surface can be built from the
 /// content.
-pub(super) fn surface(path: &Path, projection: PlaneProjection, given: &NominalTable) -> Result<Nominal, Failure> {
+pub(super) fn surface(
+    path: &Path,
+    projection: PlaneProjection,
+    given: &NominalTable,
+) -> Result<(Nominal, Option<String>), Failure> {
     let file = read(path, projection, &given.table())?;
-    setup::nominal_from_file(path, file, projection, &given.selection()).map_err(Failure::Setup)
+    let choice = file.chosen_in_words(&given.selection());
+    let nominal = setup::nominal_from_file(path, file, projection, &given.selection()).map_err(Failure::Setup)?;
+    Ok((nominal, choice))
 }
 
 /// Samples a surface at the spacing that its definition states. `path` is used in errors.
@@ -113,9 +119,9 @@ pub(super) fn sampled(path: &Path, surface: &DefinedSurface) -> Result<SampledSu
 }
 
 /// Returns the kind of a nominal surface as text: grid with its size, scattered points with their projection, mesh, or
-/// number of patches.
-pub(super) fn kind_in_words(kind: NominalKind) -> String {
-    match kind {
+/// number of patches. `choice` says which of several surfaces of the file it is.
+pub(super) fn kind_in_words(kind: NominalKind, choice: Option<String>) -> String {
+    let kind = match kind {
         NominalKind::Grid { columns, rows } => format!("grid of {} x {}", count(columns), count(rows)),
         NominalKind::Scattered { projection } => {
             let plane = match projection {
@@ -127,5 +133,6 @@ pub(super) fn kind_in_words(kind: NominalKind) -> String {
         }
         NominalKind::Mesh => "mesh".into(),
         NominalKind::Patches { count } => format!("{count} patches"),
-    }
+    };
+    choice.map_or(kind.clone(), |choice| format!("{choice}; {kind}"))
 }

@@ -13,7 +13,7 @@ use regrind::formats::{
 use regrind::geometry::Pose;
 use regrind::model::{AngleInterval, Form, IsoFigures, ModelInputs, SlopeFigures};
 use regrind::registration::{Coordinate, Loss, Method, ProbeSide, RegistrationOptions, Start, register};
-use regrind::surface::{DistanceModel, Nominal, NominalKind, PlaneProjection};
+use regrind::surface::{DistanceModel, Nominal, PlaneProjection};
 
 use super::choice::word_of;
 use super::failure::Failure;
@@ -111,12 +111,12 @@ Exit codes: 0 registered; 2 bad arguments or data; 3 fault.";
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let options = options(arguments)?;
     let folder = ResultFolder::prepare(&arguments.out)?;
-    let (nominal, measured) = read_inputs(arguments)?;
+    let ((nominal, choice), measured) = read_inputs(arguments)?;
     let mut registration = register(&nominal, &measured.points, &options)
         .map_err(|e| Failure::of_registration(e, &arguments.nominal, &arguments.measured))?;
     registration.quality.warnings.extend(measured.notes.iter().map(ToString::to_string));
     let nominal_file =
-        NominalInput { file: &arguments.nominal, points: nominal.len(), kind: kind_in_words(nominal.kind()) };
+        NominalInput { file: &arguments.nominal, points: nominal.len(), kind: kind_in_words(nominal.kind(), choice) };
     let document = RegistrationDocument::new(&registration, &options, nominal_file, &arguments.measured);
     document.check().map_err(|what| Failure::NotFinite { what })?;
     save_registration(folder.path(), &document, &registration.deviations).map_err(Failure::NotSaved)?;
@@ -131,7 +131,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     if arguments.json {
         super::print_json(&document)?;
     } else {
-        super::print(&summary(&document, nominal.kind(), folder.path()))?;
+        super::print(&summary(&document, folder.path()))?;
         super::print(&form.as_ref().map_or(String::new(), form_in_words))?;
     }
     folder.keep();
@@ -169,12 +169,12 @@ fn options(arguments: &Arguments) -> Result<RegistrationOptions, Failure> {
     })
 }
 
-/// Reads the nominal file and the measured file that `arguments` name, in parallel. Returns the nominal surface and the
-/// measured points. The points contain notes about doubtful lines, for example a last line without a line end.
+/// Reads the nominal file and the measured file that `arguments` name, in parallel. Returns the nominal surface with
+/// the words that say which of several it is, and the measured points. The points contain notes about doubtful lines, for example a last line without a line end.
 ///
 /// Returns an error if a file is invalid. Also returns an error if the measured file is a height map (X3P, SDF or
 /// MetroPro) and the method of the registration is not `Contact`.
-fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure> {
+fn read_inputs(arguments: &Arguments) -> Result<((Nominal, Option<String>), NotedPoints), Failure> {
     let (path, projection) = (&arguments.nominal, arguments.projection);
     if is_map(&arguments.measured)? && method(arguments) != Method::Contact {
         return Err(Failure::MapOfContacts { path: arguments.measured.clone() });
@@ -190,9 +190,9 @@ fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure>
 }
 
 /// Returns the result of the registration as lines of text for an operator: the files, the numbers of points, the
-/// deviation in µm, the pose, the warnings and the alternative poses. `kind` is the kind of the nominal surface.
+/// deviation in µm, the pose, the warnings and the alternative poses.
 /// `folder` is the folder with the result files.
-fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) -> String {
+fn summary(document: &RegistrationDocument, folder: &Path) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let mut text = String::new();
     let mut line = |name: &str, words: String| {
@@ -204,7 +204,7 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
             "{}: {}, {}",
             document.nominal.file.display(),
             counted(document.nominal.points, "point"),
-            kind_in_words(kind)
+            document.nominal.kind
         ),
     );
     line(

@@ -330,8 +330,9 @@ fn write_registration(
     found: &Registration,
     options: &RegistrationOptions,
 ) -> Result<(), FormatError> {
-    let nominal =
-        NominalInput { file: &task.nominal_path, points: task.nominal.len(), kind: task.nominal.kind().to_string() };
+    let choice = task.nominal_choice.iter().map(|choice| format!("{choice}; ")).collect::<String>();
+    let kind = format!("{choice}{}", task.nominal.kind());
+    let nominal = NominalInput { file: &task.nominal_path, points: task.nominal.len(), kind };
     let mut document = RegistrationDocument::new(found, options, nominal, Path::new(CycleFile::Measured.name()));
     document.simulation = Some(task.simulation);
     for file in [CycleFile::Deviations, CycleFile::DeviationUncertainty, CycleFile::Registration] {

@@ -41,6 +41,8 @@ pub struct Task {
     pub nominal: Arc<Nominal>,
     /// Source file of the nominal surface, for the record.
     pub nominal_path: PathBuf,
+    /// Which of several surfaces of that file it is, in words.
+    pub nominal_choice: Option<String>,
     /// SHA-256 of the source: identity of the part.
     pub part_identity: [u8; 32],
     /// Targets for the probe. Empty if the machine has no plan of this program.

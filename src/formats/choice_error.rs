@@ -24,6 +24,18 @@ pub enum ChoiceError {
     /// The surface cannot be read.
     #[error("number {number}, {kind}, cannot be the nominal surface: {reason}")]
     Unreadable { number: usize, kind: String, reason: String },
+    /// The largest face is not known, because a face cannot be read.
+    #[error(
+        "the area of face {number}, {kind}, is not known, so it is not known which face is the largest: {reason}; \
+         choose a face by its number: `regrind accuracy` lists them"
+    )]
+    UnknownArea { number: usize, kind: String, reason: String },
+    /// No face is clearly the largest.
+    #[error("several faces are about as large as the largest; choose one by its number: {}", list(.numbers))]
+    SeveralLargest { numbers: Vec<usize> },
+    /// No face has an area.
+    #[error("no face of the file has an outline that encloses an area; choose one by its number and give an aperture")]
+    NoArea,
     /// A lens has several surfaces, and none was chosen.
     #[error("the lens has several curved surfaces; choose one by its number: {}", list(.numbers))]
     SeveralSurfaces { numbers: Vec<usize> },

@@ -44,6 +44,26 @@ pub enum NominalFile {
 }
 
 impl NominalFile {
+    /// Returns which surface of the file is chosen, in words. Returns `None` if the file has only one, or if none can be
+    /// chosen.
+    pub fn chosen_in_words(&self, selection: &SurfaceSelection) -> Option<String> {
+        let choice = selection.choice.as_ref();
+        let (what, number, name, kind, count) = match self {
+            Self::Faces(model) => {
+                let (number, _) = model.choose(choice).ok()?;
+                let face = &model.faces[number - 1];
+                ("face", number, &face.name, &face.kind, model.faces.len())
+            }
+            Self::Lens(lens) => {
+                let surface = lens.choose(choice).ok()?;
+                ("surface", surface.number, &surface.name, &surface.kind, lens.surfaces.len())
+            }
+            _ => return None,
+        };
+        let name = if name.is_empty() { String::new() } else { format!(" `{name}`") };
+        (count > 1).then(|| format!("{what} {number}{name} of {count}, {kind}"))
+    }
+
     /// Returns the surface of a definition or of a CAD model, as `selection` says. Returns `None` for points and meshes.
     ///
     /// # Errors

@@ -29,7 +29,7 @@ pub use grinding::{MAX_SCALLOP_SHARE, track_for_tolerance_mm};
 use grinding::{pass, programs, surface_and_outline, track_distance};
 use learning::{learning_kind, learning_setting};
 use measurement::{adaptive, expansion, lay_targets, min_found_share, probing, reference_sphere};
-use nominal::nominal_with_identity;
+use nominal::{IdentifiedNominal, nominal_with_identity};
 pub use nominal::{defined_from_file, nominal_from_file, nominal_table_format, plan_table_format, read_nominal};
 
 /// Size of one target in the registers of a plan, in bytes. A point of a result is smaller.
@@ -42,7 +42,7 @@ const MAX_TARGET_BYTES: usize = 56;
 /// Returns an error if the nominal surface or the measuring pattern cannot be read or computed, or if the recipe and
 /// the cell do not fit together, for example because a value of the recipe exceeds a limit of the cell.
 pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), SetupError> {
-    let (nominal, nominal_file, part_identity) = nominal_with_identity(recipe)?;
+    let IdentifiedNominal { nominal, path, choice, identity: part_identity } = nominal_with_identity(recipe)?;
     let side = recipe.measure.side.side().unwrap_or_default();
     let targets = lay_targets(recipe, &nominal, side)?;
     check_limits(recipe, cell, &targets)?;
@@ -66,7 +66,8 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         programs,
         scallops,
         nominal: Arc::new(nominal),
-        nominal_path: nominal_file,
+        nominal_path: path,
+        nominal_choice: choice,
         part_identity,
         probing: probing(recipe),
         reference_sphere: sphere,

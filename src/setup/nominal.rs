@@ -14,17 +14,27 @@ use crate::surface::{DefinedSurface, Nominal, PlaneProjection, SurfaceSelection}
 /// # Errors
 /// Returns an error if the file cannot be read, or if no surface can be built from the file or the formula.
 pub fn read_nominal(recipe: &Recipe) -> Result<Nominal, SetupError> {
-    nominal_with_identity(recipe).map(|(nominal, ..)| nominal)
+    nominal_with_identity(recipe).map(|found| found.nominal)
 }
 
-/// Reads the nominal surface from a file, or samples it from a formula. Returns the surface, the path of its source
-/// (the file or the recipe), and the SHA-256 that identifies the part.
-pub(super) fn nominal_with_identity(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> {
+/// Nominal surface and its source.
+pub(super) struct IdentifiedNominal {
+    pub nominal: Nominal,
+    /// The file, or the recipe.
+    pub path: PathBuf,
+    /// Which of several surfaces of the file it is, in words.
+    pub choice: Option<String>,
+    /// SHA-256 that identifies the part.
+    pub identity: [u8; 32],
+}
+
+/// Reads the nominal surface from a file, or samples it from a formula.
+pub(super) fn nominal_with_identity(recipe: &Recipe) -> Result<IdentifiedNominal, SetupError> {
     match &recipe.nominal {
         NominalSource::Surface(surface) => {
             let nominal = sample_surface(recipe.path(), surface)?;
             let identity = surface_identity(&nominal);
-            Ok((nominal, recipe.path().to_owned(), identity))
+            Ok(IdentifiedNominal { nominal, path: recipe.path().to_owned(), choice: None, identity })
         }
         NominalSource::File { path, table, projection, selection } => {
             let table = nominal_table_format(table).map_err(|(key, what)| SetupError::Table {
@@ -33,8 +43,9 @@ pub(super) fn nominal_with_identity(recipe: &Recipe) -> Result<(Nominal, PathBuf
                 what,
             })?;
             let (file, identity) = formats::read_nominal_with_identity(path, &table, selection)?;
+            let choice = file.chosen_in_words(selection);
             let nominal = nominal_from_file(path, file, *projection, selection)?;
-            Ok((nominal, path.clone(), identity))
+            Ok(IdentifiedNominal { nominal, path: path.clone(), choice, identity })
         }
     }
 }

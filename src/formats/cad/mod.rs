@@ -2,6 +2,7 @@
 //!
 //! ```text
 //!  bytes --step_text--> entities --step_geometry--> curves, surfaces --step--> faces with outlines
+//!                          \--step_structure--> parts, placements, units --/
 //!  bytes --iges_text--> entities ---------------------------------iges--> faces with outlines
 //! ```
 //!
@@ -13,6 +14,7 @@ mod model;
 mod outline;
 mod step;
 mod step_geometry;
+mod step_structure;
 mod step_text;
 
 use std::path::Path;

@@ -7,6 +7,10 @@ use regrind_core::surface::parametric::Face;
 use super::super::choice_error::{ChoiceError, number_of};
 use super::super::error::FormatError;
 
+/// Share by which the largest face must exceed the next one. The areas are sums over small patches, with an error of
+/// about 1 %.
+const MIN_AREA_STEP: f64 = 0.02;
+
 /// Face of a CAD model as the file has it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CadFace {
@@ -47,16 +51,19 @@ impl CadModel {
         Self { faces }
     }
 
-    /// Returns the number, counted from 1, and the face that is chosen. Without a choice it is the largest.
+    /// Returns the number, counted from 1, and the face that is chosen. Without a choice it is the largest, if it is
+    /// clear which one that is.
     ///
     /// # Errors
-    /// Returns an error if there is no such face, if several have the name, or if the face cannot be read.
+    /// Returns an error if there is no such face, if several have the name, if the face cannot be read, or if no face
+    /// is clearly the largest.
     pub fn choose(&self, choice: Option<&SurfaceChoice>) -> Result<(usize, &Face), ChoiceError> {
         let names: Vec<&str> = self.faces.iter().map(|face| &face.name[..]).collect();
         let number = match choice {
             Some(SurfaceChoice::Number(number)) => *number,
             Some(SurfaceChoice::Name(name)) => number_of(name, &names)?,
-            None | Some(SurfaceChoice::Largest) => self.largest()?,
+            Some(SurfaceChoice::Largest) => self.largest()?,
+            None => self.only_possible()?,
         };
         let face = number.checked_sub(1).and_then(|at| self.faces.get(at));
         let face = face.ok_or(ChoiceError::NoNumber { number, count: self.faces.len() })?;
@@ -65,13 +72,31 @@ impl CadModel {
         face.face.as_ref().map(|face| (number, face)).map_err(unreadable)
     }
 
-    /// Returns the number of the face with the largest area.
+    /// Returns the number of the largest face, if no face could be larger: each can be read.
+    fn only_possible(&self) -> Result<usize, ChoiceError> {
+        let unreadable =
+            (1..).zip(&self.faces).find_map(|(number, face)| Some((number, face, face.face.as_ref().err()?)));
+        match unreadable {
+            None => self.largest(),
+            Some((number, face, reason)) if self.faces.len() == 1 => {
+                Err(ChoiceError::Unreadable { number, kind: face.kind.clone(), reason: reason.clone() })
+            }
+            Some((number, face, reason)) => {
+                Err(ChoiceError::UnknownArea { number, kind: face.kind.clone(), reason: reason.clone() })
+            }
+        }
+    }
+
+    /// Returns the number of the face with the largest area, among those that can be read.
     fn largest(&self) -> Result<usize, ChoiceError> {
         let areas = (1..).zip(&self.faces).filter_map(|(n, face)| Some((n, face.face.as_ref().ok()?.area_mm2())));
-        match areas.max_by(|a, b| a.1.total_cmp(&b.1)) {
-            Some((number, area)) if area > 0.0 => Ok(number),
-            // The reason of the first face is as good as any.
-            _ => Ok(1),
+        let areas: Vec<(usize, f64)> = areas.filter(|(_, area)| area.is_finite() && *area > 0.0).collect();
+        let largest = areas.iter().fold(0.0f64, |largest, (_, area)| largest.max(*area));
+        let alike = areas.iter().filter(|(_, area)| *area >= largest * (1.0 - MIN_AREA_STEP));
+        match alike.map(|(number, _)| *number).collect::<Vec<_>>()[..] {
+            [number] => Ok(number),
+            [] => Err(ChoiceError::NoArea),
+            ref numbers => Err(ChoiceError::SeveralLargest { numbers: numbers.to_vec() }),
         }
     }
 }

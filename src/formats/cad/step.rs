@@ -7,7 +7,7 @@
 //! A part that occurs several times gives its faces several times. Surfaces that no face refers to are faces with the
 //! border of their domain as the outline. Units are those of the context of each representation.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashSet;
 use std::path::Path;
 
 use regrind_core::geometry::{Point, Pose};
@@ -18,13 +18,20 @@ use regrind_core::surface::parametric::{
 use super::super::error::FormatError;
 use super::model::{CadFace, CadModel};
 use super::outline::{EdgePlaces, joined_outlines};
-use super::step_geometry::{Attributes, Geometry, Units, as_number, as_reference, as_references};
-use super::step_text::{StepText, Value};
+use super::step_geometry::{Attributes, Geometry, OrientedSurface};
+use super::step_structure::Structure;
+use super::step_text::StepText;
 
 /// Maximum number of faces, with those of parts that occur several times.
 const MAX_FACES: usize = 200_000;
 
-/// Maximum depth of assemblies and of shells.
+/// Maximum number of places of all outlines, with those of parts that occur several times: about 250 MB.
+const MAX_PLACES: usize = 10_000_000;
+
+/// Maximum number of items of all representations, with those of sets that occur several times.
+const MAX_ITEMS: usize = 500_000;
+
+/// Maximum depth of shells and of representations within each other.
 const MAX_DEPTH: usize = 32;
 
 /// Names of the types of a surface that a bare surface can have.
@@ -51,13 +58,22 @@ const SURFACES: [&str; 12] = [
 pub(super) fn parse_step(path: &Path, bytes: &[u8]) -> Result<CadModel, FormatError> {
     let text = StepText::new(path, bytes)?;
     let structure = Structure::new(&text)?;
-    let mut reader = Reader { text: &text, faces: Vec::new(), taken: HashSet::new() };
+    let mut reader = Reader {
+        text: &text,
+        structure: &structure,
+        faces: Vec::new(),
+        taken: HashSet::new(),
+        item_count: 0,
+        place_count: 0,
+    };
     for representation in structure.with_items.iter().filter(|shape| !structure.mapped.contains(&shape.number)) {
-        let units = structure.units(&text, representation.context)?;
+        let geometry = Geometry { text: &text, units: structure.units_of(&text, representation.number)? };
         let mut found = Vec::new();
-        let geometry = Geometry { text: &text, units };
         for &item in &representation.items {
-            reader.collect(&geometry, item, &Pose::identity(), 0, &mut found)?;
+            reader.collect(&geometry, item, Way::start(), &mut found)?;
+        }
+        if found.is_empty() {
+            continue;
         }
         for placement in structure.placements(&text, representation.number)? {
             for face in &found {
@@ -65,7 +81,7 @@ pub(super) fn parse_step(path: &Path, bytes: &[u8]) -> Result<CadModel, FormatEr
             }
         }
     }
-    reader.collect_bare(&structure)?;
+    reader.collect_bare()?;
     if reader.faces.is_empty() {
         return Err(FormatError::NoData { path: path.to_owned(), expected: "face or surface" });
     }
@@ -75,15 +91,42 @@ pub(super) fn parse_step(path: &Path, bytes: &[u8]) -> Result<CadModel, FormatEr
 /// Collector of faces.
 struct Reader<'a> {
     text: &'a StepText<'a>,
+    structure: &'a Structure,
     faces: Vec<CadFace>,
     /// Surfaces that a face has.
     taken: HashSet<u64>,
+    /// Number of items that were visited.
+    item_count: usize,
+    /// Number of places of the outlines of all faces.
+    place_count: usize,
+}
+
+/// Way from a representation to one of its items.
+#[derive(Clone, Copy)]
+struct Way {
+    placement: Pose,
+    depth: usize,
+    /// True if the item lies in a shell around a solid, so that its outside is known.
+    is_closed: bool,
+    /// True if the item is used with its sides exchanged.
+    is_turned: bool,
+}
+
+impl Way {
+    fn start() -> Self {
+        Self { placement: Pose::identity(), depth: 0, is_closed: false, is_turned: false }
+    }
 }
 
 impl<'a> Reader<'a> {
     fn push(&mut self, face: CadFace) -> Result<(), FormatError> {
         if self.faces.len() == MAX_FACES {
             return Err(self.text.unexpected(0, "at most 200000 faces", "more"));
+        }
+        let outlines = face.face.as_ref().map_or(&[][..], |face| &face.outlines);
+        self.place_count += outlines.iter().map(Vec::len).sum::<usize>();
+        if self.place_count > MAX_PLACES {
+            return Err(self.text.unexpected(0, "outlines of at most 10000000 places", "more"));
         }
         self.faces.push(face);
         Ok(())
@@ -94,39 +137,41 @@ impl<'a> Reader<'a> {
         &mut self,
         geometry: &Geometry<'a>,
         item: u64,
-        placement: &Pose,
-        depth: usize,
+        way: Way,
         found: &mut Vec<CadFace>,
     ) -> Result<(), FormatError> {
-        if depth > MAX_DEPTH || found.len() > MAX_FACES {
-            return Err(self.text.unexpected(item, "items that are not made of themselves", "a deep nest"));
+        self.item_count += 1;
+        if way.depth > MAX_DEPTH || self.item_count > MAX_ITEMS || found.len() > MAX_FACES {
+            return Err(self.text.unexpected(item, "at most 500000 items, not made of themselves", "more"));
         }
         let entity = geometry.entity(item)?;
-        let mut all = |numbers: Vec<u64>, found: &mut Vec<CadFace>| {
-            numbers.into_iter().try_for_each(|n| self.collect(geometry, n, placement, depth + 1, found))
+        let way = Way { depth: way.depth + 1, ..way };
+        let mut all = |numbers: Vec<u64>, way: Way, found: &mut Vec<CadFace>| {
+            numbers.into_iter().try_for_each(|n| self.collect(geometry, n, way, found))
         };
         match entity.name() {
-            "MANIFOLD_SOLID_BREP" | "FACETED_BREP" => all(vec![entity.reference(1)?], found),
+            "MANIFOLD_SOLID_BREP" | "FACETED_BREP" => all(vec![entity.reference(1)?], way, found),
             "BREP_WITH_VOIDS" => {
-                all(vec![entity.reference(1)?], found)?;
-                all(entity.references(2)?, found)
+                all(vec![entity.reference(1)?], way, found)?;
+                all(entity.references(2)?, way, found)
             }
-            "ORIENTED_CLOSED_SHELL" | "ORIENTED_OPEN_SHELL" => all(vec![entity.reference(2)?], found),
-            "SHELL_BASED_SURFACE_MODEL"
-            | "FACE_BASED_SURFACE_MODEL"
-            | "OPEN_SHELL"
-            | "CLOSED_SHELL"
-            | "CONNECTED_FACE_SET"
-            | "GEOMETRIC_SET" => all(entity.references(1)?, found),
+            "ORIENTED_CLOSED_SHELL" | "ORIENTED_OPEN_SHELL" | "ORIENTED_FACE" => {
+                let is_turned = way.is_turned == entity.logical(3)?.unwrap_or(true);
+                all(vec![entity.reference(2)?], Way { is_turned, ..way }, found)
+            }
+            "CLOSED_SHELL" => all(entity.references(1)?, Way { is_closed: true, ..way }, found),
+            "OPEN_SHELL" | "CONNECTED_FACE_SET" => all(entity.references(1)?, Way { is_closed: false, ..way }, found),
+            "SHELL_BASED_SURFACE_MODEL" | "FACE_BASED_SURFACE_MODEL" | "GEOMETRIC_SET" => {
+                all(entity.references(1)?, way, found)
+            }
             "ADVANCED_FACE" | "FACE_SURFACE" => {
-                found.push(self.face(geometry, &entity)?.moved(placement));
+                found.push(self.face(geometry, &entity, way)?.moved(&way.placement));
                 Ok(())
             }
-            "ORIENTED_FACE" => all(vec![entity.reference(2)?], found),
-            "MAPPED_ITEM" => self.mapped(geometry, &entity, placement, depth, found),
+            "MAPPED_ITEM" => self.mapped(geometry, &entity, way, found),
             name if SURFACES.contains(&name) || entity.has("B_SPLINE_SURFACE") => {
                 self.taken.insert(item);
-                found.push(bare_face(geometry, item, &entity).moved(placement));
+                found.push(bare_face(geometry, item, &entity).moved(&way.placement));
                 Ok(())
             }
             // Curves, points, placements, notes.
@@ -134,25 +179,26 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Collects the faces of a representation that stands in another one.
+    /// Collects the faces of a representation that stands in another one. It has the units of its own context.
     fn mapped(
         &mut self,
         geometry: &Geometry<'a>,
         entity: &Attributes<'a>,
-        placement: &Pose,
-        depth: usize,
+        way: Way,
         found: &mut Vec<CadFace>,
     ) -> Result<(), FormatError> {
         let map = geometry.entity(entity.reference(1)?)?;
-        let (origin, source) = (map.reference(0)?, geometry.entity(map.reference(1)?)?);
+        let (origin, source_number) = (map.reference(0)?, map.reference(1)?);
+        let inner = Geometry { text: self.text, units: self.structure.units_of(self.text, source_number)? };
+        let source = inner.entity(source_number)?;
         let target = geometry.frame(entity.reference(2)?)?;
-        let motion = target.pose() * geometry.frame(origin)?.pose().inverse();
-        let placement = *placement * motion;
-        source.references(1)?.into_iter().try_for_each(|n| self.collect(geometry, n, &placement, depth + 1, found))
+        let motion = target.pose() * inner.frame(origin)?.pose().inverse();
+        let way = Way { placement: way.placement * motion, ..way };
+        source.references(1)?.into_iter().try_for_each(|n| self.collect(&inner, n, way, found))
     }
 
     /// Reads a face with its outlines. The reason why it cannot be read is kept with it.
-    fn face(&mut self, geometry: &Geometry<'a>, entity: &Attributes<'a>) -> Result<CadFace, FormatError> {
+    fn face(&mut self, geometry: &Geometry<'a>, entity: &Attributes<'a>, way: Way) -> Result<CadFace, FormatError> {
         let surface_number = entity.reference(2)?;
         self.taken.insert(surface_number);
         let surface = geometry.entity(surface_number)?;
@@ -161,15 +207,17 @@ impl<'a> Reader<'a> {
         let same_sense = entity.logical(3)?.unwrap_or(true);
         let read = || {
             let outlines = outlines(geometry, &entity.references(1)?)?;
-            let surface = geometry.surface(surface_number)?;
-            Ok(Face { name: label.clone(), surface, normal_points_out: Some(same_sense), outlines })
+            let OrientedSurface { surface, is_turned } = geometry.oriented_surface(surface_number)?;
+            let points_out = same_sense != (is_turned != way.is_turned);
+            let normal_points_out = way.is_closed.then_some(points_out);
+            Ok(Face { name: label.clone(), surface, normal_points_out, outlines })
         };
         Ok(CadFace::new(label.clone(), kind, read()))
     }
 
     /// Adds the surfaces to which no face and no representation refers.
-    fn collect_bare(&mut self, structure: &Structure) -> Result<(), FormatError> {
-        let used = structure.used_surfaces(self.text)?;
+    fn collect_bare(&mut self) -> Result<(), FormatError> {
+        let used = self.structure.used_surfaces(self.text)?;
         let bare: Vec<u64> =
             self.text.numbers().iter().copied().filter(|n| !self.taken.contains(n) && !used.contains(n)).collect();
         for number in bare {
@@ -181,7 +229,7 @@ impl<'a> Reader<'a> {
             if !SURFACES.contains(&entity.name()) && !entity.has("B_SPLINE_SURFACE") {
                 continue;
             }
-            let units = structure.units(self.text, None)?;
+            let units = self.structure.units(self.text, None)?;
             let face = bare_face(&Geometry { text: self.text, units }, number, &entity);
             self.push(face)?;
         }
@@ -194,11 +242,11 @@ fn bare_face(geometry: &Geometry<'_>, number: u64, entity: &Attributes<'_>) -> C
     let label = entity.label();
     let read = || {
         let (surface, outlines) = if entity.name() == "RECTANGULAR_TRIMMED_SURFACE" {
-            let (surface, part) = geometry.rectangle(entity)?;
+            let (OrientedSurface { surface, .. }, part) = geometry.rectangle(entity, 0)?;
             let outlines = natural_outlines(&surface, part);
             (surface, outlines)
         } else {
-            (geometry.surface(number)?, Vec::new())
+            (geometry.oriented_surface(number)?.surface, Vec::new())
         };
         if outlines.is_empty() && !matches!(surface, ParametricSurface::BSpline(_)) {
             return Err(entity.wrong("a face with an outline; this surface is endless"));
@@ -310,12 +358,16 @@ pub(super) fn edge_places(curve: &Curve, ends: [Point; 2], is_closed: bool, same
             to = if is_closed { from - turn } else { to - turn };
         }
     } else if let Some([low, high]) = curve.domain() {
+        let small = 1e-9 * (high - low);
         if is_closed {
-            [from, to] = if same_sense { [low, high] } else { [high, low] };
+            // The vertex can lie anywhere on the closed curve.
+            wraps = from - low > small && high - from > small;
+            if !wraps {
+                [from, to] = if same_sense { [low, high] } else { [high, low] };
+            }
         } else if (to - from) * if same_sense { 1.0 } else { -1.0 } < 0.0 {
             // The nearest parameter of the point where the curve closes is that of the other end, or the edge passes it.
             let [first, last] = if same_sense { [low, high] } else { [high, low] };
-            let small = 1e-9 * (high - low);
             if (to - first).abs() <= small {
                 to = last;
             } else if (from - last).abs() <= small {
@@ -339,302 +391,4 @@ pub(super) fn edge_places(curve: &Curve, ends: [Point; 2], is_closed: bool, same
     places[0] = ends[0];
     places[count - 1] = ends[1];
     places
-}
-
-/// Representation that has items.
-struct Representation {
-    number: u64,
-    items: Vec<u64>,
-    context: Option<u64>,
-}
-
-/// Relation of the parts: their representations, contexts and placements.
-struct Structure {
-    with_items: Vec<Representation>,
-    /// Contexts by the number of the representation.
-    contexts: HashMap<u64, Option<u64>>,
-    /// Representations with the same frame: the number of one of them for each.
-    same: HashMap<u64, u64>,
-    /// Where a representation occurs: the outer one, and the two placements whose frames coincide.
-    outer: HashMap<u64, Vec<Occurrence>>,
-    /// Contexts that state a unit of length.
-    contexts_with_units: Vec<u64>,
-    /// Representations that occur as an item of another one.
-    mapped: HashSet<u64>,
-}
-
-/// Place of a representation in another one.
-#[derive(Clone, Copy)]
-struct Occurrence {
-    outer: u64,
-    /// Placement in the inner one and in the outer one, with the representations that tell their units.
-    frames: [(u64, u64); 2],
-}
-
-impl Structure {
-    fn new(text: &StepText<'_>) -> Result<Self, FormatError> {
-        let mut structure = Self {
-            with_items: Vec::new(),
-            contexts: HashMap::new(),
-            same: HashMap::new(),
-            outer: HashMap::new(),
-            contexts_with_units: Vec::new(),
-            mapped: HashSet::new(),
-        };
-        let mut relations = Vec::new();
-        let mut products = Products::default();
-        for &number in text.numbers() {
-            let Some(name) = text.type_name(number) else { continue };
-            if name.ends_with("REPRESENTATION_CONTEXT") || name.starts_with("GLOBAL_UN") {
-                let entity = Attributes::new(text, number)?;
-                if entity.has("GLOBAL_UNIT_ASSIGNED_CONTEXT") {
-                    structure.contexts_with_units.push(number);
-                }
-            } else if is_representation(&name) {
-                structure.add_representation(text, number)?;
-            } else if name == "REPRESENTATION_MAP" {
-                structure.mapped.insert(Attributes::new(text, number)?.reference(1)?);
-            } else if name.contains("REPRESENTATION_RELATIONSHIP") {
-                relations.push(number);
-            } else {
-                products.note(text, number, &name)?;
-            }
-        }
-        for relation in relations {
-            structure.relate(text, relation, &products)?;
-        }
-        Ok(structure)
-    }
-
-    fn add_representation(&mut self, text: &StepText<'_>, number: u64) -> Result<(), FormatError> {
-        let entity = Attributes::new(text, number)?;
-        // A complex entity has the attributes in the part of the general type.
-        let values = entity.values_of("REPRESENTATION").map(<[Value]>::to_vec);
-        let (items, context) = match values {
-            Some(values) => {
-                (values.get(1).and_then(as_references).unwrap_or_default(), values.get(2).and_then(as_reference))
-            }
-            None => (as_references(entity.at(1)?).unwrap_or_default(), entity.at(2).ok().and_then(as_reference)),
-        };
-        self.contexts.insert(number, context);
-        // Symbols and pictures have no shape.
-        if entity.name().ends_with("SHAPE_REPRESENTATION") {
-            self.with_items.push(Representation { number, items, context });
-        }
-        Ok(())
-    }
-
-    /// Notes a relationship of two representations: with a transformation the first is a part of the second, without one
-    /// both have the same frame.
-    fn relate(&mut self, text: &StepText<'_>, number: u64, products: &Products) -> Result<(), FormatError> {
-        let entity = Attributes::new(text, number)?;
-        let values =
-            entity.values_of("REPRESENTATION_RELATIONSHIP").or(entity.values_of("SHAPE_REPRESENTATION_RELATIONSHIP"));
-        let pair = values.and_then(|values| Some([as_reference(values.get(2)?)?, as_reference(values.get(3)?)?]));
-        let Some([first, second]) = pair else { return Ok(()) };
-        let with = entity.values_of("REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION");
-        let Some(operator) = with.and_then(<[Value]>::first).and_then(as_reference) else {
-            let (a, b) = (self.frame_of(first), self.frame_of(second));
-            if a != b {
-                self.same.insert(a, b);
-            }
-            return Ok(());
-        };
-        let transformation = Attributes::new(text, operator)?;
-        if transformation.name() != "ITEM_DEFINED_TRANSFORMATION" {
-            return Err(transformation.wrong("ITEM_DEFINED_TRANSFORMATION"));
-        }
-        let frames = [(transformation.reference(2)?, first), (transformation.reference(3)?, second)];
-        // Some programs write the assembly first; the product structure tells which is the part.
-        let is_turned = products.part_of(number).is_some_and(|part| part == second);
-        let (inner, outer, frames) =
-            if is_turned { (second, first, [frames[1], frames[0]]) } else { (first, second, frames) };
-        self.outer.entry(inner).or_default().push(Occurrence { outer, frames });
-        Ok(())
-    }
-
-    /// Returns the number that stands for all representations with the same frame as this one.
-    fn frame_of(&self, mut number: u64) -> u64 {
-        while let Some(&next) = self.same.get(&number) {
-            number = next;
-        }
-        number
-    }
-
-    /// Returns the poses at which a representation occurs in the file.
-    fn placements(&self, text: &StepText<'_>, number: u64) -> Result<Vec<Pose>, FormatError> {
-        let mut placements = Vec::new();
-        self.add_placements(text, number, Pose::identity(), 0, &mut placements)?;
-        Ok(placements)
-    }
-
-    fn add_placements(
-        &self,
-        text: &StepText<'_>,
-        number: u64,
-        pose: Pose,
-        depth: usize,
-        placements: &mut Vec<Pose>,
-    ) -> Result<(), FormatError> {
-        if depth > MAX_DEPTH || placements.len() > MAX_FACES {
-            return Err(text.unexpected(number, "an assembly that is not a part of itself", "a deep nest"));
-        }
-        let frame = self.frame_of(number);
-        let alike = self.outer.iter().filter(|(inner, _)| self.frame_of(**inner) == frame);
-        let mut occurrences: Vec<Occurrence> = alike.flat_map(|(_, occurrences)| occurrences).copied().collect();
-        occurrences.sort_by_key(|occurrence| (occurrence.outer, occurrence.frames));
-        if occurrences.is_empty() {
-            placements.push(pose);
-            return Ok(());
-        }
-        for Occurrence { outer, frames } in occurrences {
-            let frame = |(placement, representation): (u64, u64)| {
-                let units = self.units(text, self.contexts.get(&representation).copied().flatten())?;
-                Ok::<_, FormatError>(Geometry { text, units }.frame(placement)?.pose())
-            };
-            let step = frame(frames[1])? * frame(frames[0])?.inverse();
-            self.add_placements(text, outer, step * pose, depth + 1, placements)?;
-        }
-        Ok(())
-    }
-
-    /// Returns the units of a context. Without a context, those on which all contexts of the file agree.
-    fn units(&self, text: &StepText<'_>, context: Option<u64>) -> Result<Units, FormatError> {
-        let stated = context.filter(|context| self.contexts_with_units.contains(context));
-        let contexts = match stated {
-            Some(context) => vec![context],
-            None => self.contexts_with_units.clone(),
-        };
-        let mut units: Option<Units> = None;
-        for context in contexts {
-            let found = context_units(text, context)?;
-            if units.is_some_and(|units| units != found) {
-                return Err(text.unexpected(context, "one unit of length for a surface without a context", "several"));
-            }
-            units = Some(found);
-        }
-        units.ok_or_else(|| text.unexpected(context.unwrap_or(0), "a context with a unit of length", "none"))
-    }
-
-    /// Returns the surfaces that are a part of another surface.
-    fn used_surfaces(&self, text: &StepText<'_>) -> Result<HashSet<u64>, FormatError> {
-        let mut used = HashSet::new();
-        for &number in text.numbers() {
-            let name = text.type_name(number).unwrap_or_default();
-            if matches!(
-                name.as_str(),
-                "RECTANGULAR_TRIMMED_SURFACE" | "CURVE_BOUNDED_SURFACE" | "OFFSET_SURFACE" | "PCURVE"
-            ) {
-                used.insert(Attributes::new(text, number)?.reference(1)?);
-            }
-        }
-        Ok(used)
-    }
-}
-
-fn is_representation(name: &str) -> bool {
-    // This one relates a placement and an occurrence.
-    let is_relation = name == "CONTEXT_DEPENDENT_SHAPE_REPRESENTATION";
-    (name.ends_with("SHAPE_REPRESENTATION") && !is_relation) || name == "REPRESENTATION"
-}
-
-/// Product structure, by which an assembly and its parts are told apart.
-#[derive(Default)]
-struct Products {
-    /// Representation by the definition of the shape that it represents.
-    by_shape: HashMap<u64, u64>,
-    /// Product or occurrence that a definition of a shape defines.
-    defined: HashMap<u64, u64>,
-    /// Product that occurs, by the occurrence.
-    occurring: HashMap<u64, u64>,
-    /// Definition of the shape by the relationship that places it.
-    by_relation: HashMap<u64, u64>,
-}
-
-impl Products {
-    fn note(&mut self, text: &StepText<'_>, number: u64, name: &str) -> Result<(), FormatError> {
-        let (map, key, value) = match name {
-            "SHAPE_DEFINITION_REPRESENTATION" => (&mut self.by_shape, 0, 1),
-            "CONTEXT_DEPENDENT_SHAPE_REPRESENTATION" => (&mut self.by_relation, 0, 1),
-            "PRODUCT_DEFINITION_SHAPE" => {
-                let defined = Attributes::new(text, number)?.reference(2)?;
-                self.defined.insert(number, defined);
-                return Ok(());
-            }
-            "NEXT_ASSEMBLY_USAGE_OCCURRENCE" => {
-                let part = Attributes::new(text, number)?.reference(4)?;
-                self.occurring.insert(number, part);
-                return Ok(());
-            }
-            _ => return Ok(()),
-        };
-        let entity = Attributes::new(text, number)?;
-        map.insert(entity.reference(key)?, entity.reference(value)?);
-        Ok(())
-    }
-
-    /// Returns the representation of the part that a relationship places.
-    fn part_of(&self, relation: u64) -> Option<u64> {
-        let occurrence = self.defined.get(self.by_relation.get(&relation)?)?;
-        let part = self.occurring.get(occurrence)?;
-        let mut shapes: Vec<u64> =
-            self.defined.iter().filter(|(_, defined)| *defined == part).map(|(shape, _)| *shape).collect();
-        shapes.sort_unstable();
-        shapes.into_iter().find_map(|shape| self.by_shape.get(&shape).copied())
-    }
-}
-
-/// Reads the units of length and of plane angle of a context.
-fn context_units(text: &StepText<'_>, context: u64) -> Result<Units, FormatError> {
-    let entity = Attributes::new(text, context)?;
-    let units = entity.values_of("GLOBAL_UNIT_ASSIGNED_CONTEXT").and_then(<[Value]>::first).and_then(as_references);
-    let (mut length_mm, mut angle_rad) = (None, 1.0);
-    for unit in units.unwrap_or_default() {
-        let described = Attributes::new(text, unit)?;
-        if described.has("LENGTH_UNIT") {
-            length_mm = Some(1e3 * unit_size(text, &described, 0)?);
-        } else if described.has("PLANE_ANGLE_UNIT") {
-            angle_rad = unit_size(text, &described, 0)?;
-        }
-    }
-    let length_mm = length_mm.ok_or_else(|| entity.wrong("a unit of length"))?;
-    Ok(Units { length_mm, angle_rad })
-}
-
-/// Returns the size of a unit in metres or radians.
-fn unit_size(text: &StepText<'_>, unit: &Attributes<'_>, depth: usize) -> Result<f64, FormatError> {
-    if let Some(values) = unit.values_of("SI_UNIT") {
-        let word = |at: usize| match values.get(at) {
-            Some(Value::Word(word)) => word.as_str(),
-            _ => "",
-        };
-        let factor = match word(0) {
-            "" => 1.0,
-            "KILO" => 1e3,
-            "HECTO" => 1e2,
-            "DECA" => 1e1,
-            "DECI" => 1e-1,
-            "CENTI" => 1e-2,
-            "MILLI" => 1e-3,
-            "MICRO" => 1e-6,
-            "NANO" => 1e-9,
-            _ => return Err(unit.wrong("a unit with a prefix from nano to kilo")),
-        };
-        return if matches!(word(1), "METRE" | "RADIAN") { Ok(factor) } else { Err(unit.wrong("metre or radian")) };
-    }
-    let measure = unit.values_of("CONVERSION_BASED_UNIT").and_then(|values| values.get(1)).and_then(as_reference);
-    let (Some(measure), true) = (measure, depth < 8) else {
-        return Err(unit.wrong("a unit of the SI, or one that is derived from it"));
-    };
-    let measure = Attributes::new(text, measure)?;
-    let values = measure.values_of("MEASURE_WITH_UNIT").map(<[Value]>::to_vec);
-    let (factor, base) = match values {
-        Some(values) => (values.first().and_then(as_number), values.get(1).and_then(as_reference)),
-        None => (as_number(measure.at(0)?), as_reference(measure.at(1)?)),
-    };
-    let (Some(factor), Some(base)) = (factor.filter(|f| *f > 0.0), base) else {
-        return Err(measure.wrong("a factor above 0 and its unit"));
-    };
-    // 25.4 mm in metres must be 0.0254 exactly, and the product with 1000 again 25.4.
-    Ok(factor * unit_size(text, &Attributes::new(text, base)?, depth + 1)?)
 }

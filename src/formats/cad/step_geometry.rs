@@ -112,6 +112,13 @@ fn as_count(value: &Value) -> Option<usize> {
     as_number(value).filter(|n| (0.0..1e9).contains(n) && n.fract() == 0.0).map(|n| n as usize)
 }
 
+/// Surface of a file.
+pub(super) struct OrientedSurface {
+    pub(super) surface: ParametricSurface,
+    /// True if du x dv of `surface` is the opposite of the normal of the surface in the file.
+    pub(super) is_turned: bool,
+}
+
 /// Geometry of one representation, in its units.
 pub(super) struct Geometry<'a> {
     pub(super) text: &'a StepText<'a>,
@@ -170,10 +177,10 @@ impl<'a> Geometry<'a> {
         let axis = |at: usize| entity.at(at).ok().and_then(as_reference).map(|n| self.direction(n)).transpose();
         let z = axis(2)?.unwrap_or_else(Vector::z);
         let given = axis(3)?;
-        let x = given.unwrap_or_else(|| if z.x.abs() < 0.9 { Vector::x() } else { Vector::y() });
-        // A reference along the axis leaves the direction about it open; any will do.
-        let other = if z.x.abs() < 0.9 { Vector::x() } else { Vector::y() };
-        let frame = Frame::new(origin, z, x).or_else(|| Frame::new(origin, z, other));
+        // A reference along the axis leaves the direction about it open. Then, and without one, it is x, or y if the axis
+        // is along x: ISO 10303-42, first_proj_axis.
+        let references = [given, Some(Vector::x()), Some(Vector::y())];
+        let frame = references.into_iter().flatten().find_map(|x| Frame::new(origin, z, x));
         frame.ok_or_else(|| entity.wrong("a placement with axes that are not parallel"))
     }
 
@@ -196,7 +203,8 @@ impl<'a> Geometry<'a> {
         }
     }
 
-    /// Reads a curve. A trimmed curve is taken without its ends, an edge on a surface by its curve in space.
+    /// Reads a curve. A trimmed curve is taken without its ends, an edge on a surface by its curve in space. The parameter
+    /// runs as that of the curve of the file.
     pub(super) fn curve(&self, number: u64) -> Result<Curve, FormatError> {
         self.curve_within(number, 0)
     }
@@ -232,8 +240,12 @@ impl<'a> Geometry<'a> {
             "PARABOLA" => {
                 Curve::Parabola { frame: self.frame(entity.reference(1)?)?, focal_mm: self.length(&entity, 2)? }
             }
-            "SURFACE_CURVE" | "SEAM_CURVE" | "INTERSECTION_CURVE" | "BOUNDED_SURFACE_CURVE" | "TRIMMED_CURVE" => {
+            "SURFACE_CURVE" | "SEAM_CURVE" | "INTERSECTION_CURVE" | "BOUNDED_SURFACE_CURVE" => {
                 self.curve_within(entity.reference(1)?, depth + 1)?
+            }
+            "TRIMMED_CURVE" => {
+                let whole = self.curve_within(entity.reference(1)?, depth + 1)?;
+                if entity.logical(4)? == Some(false) { whole.reversed() } else { whole }
             }
             _ => return Err(entity.wrong("a line, circle, ellipse, hyperbola, parabola or B-spline curve")),
         })
@@ -242,10 +254,10 @@ impl<'a> Geometry<'a> {
     /// Reads the profile of a surface: a curve, or a part of one.
     fn profile(&self, number: u64) -> Result<Curve, FormatError> {
         let entity = self.entity(number)?;
-        let whole = self.curve(number)?;
         if entity.name() != "TRIMMED_CURVE" {
-            return Ok(whole);
+            return self.curve(number);
         }
+        let whole = self.curve(entity.reference(1)?)?;
         let end = |at: usize| -> Result<f64, FormatError> {
             let Value::List(ways) = entity.at(at)? else { return Err(entity.wrong("the ends of a trimmed curve")) };
             let by_point = ways.iter().find_map(as_reference).map(|n| self.point(n)).transpose()?;
@@ -256,33 +268,55 @@ impl<'a> Geometry<'a> {
             let point = by_point.map(|p| whole.parameter_near(&p));
             by_parameter.or(point).ok_or_else(|| entity.wrong("the ends of a trimmed curve"))
         };
-        let [mut from, mut to] = [end(2)?, end(3)?];
-        if entity.logical(4)? == Some(false) {
-            (from, to) = (to, from);
+        let is_turned = entity.logical(4)? == Some(false);
+        let mut ends = part_range([end(2)?, end(3)?], whole.period(), !is_turned);
+        if let (Curve::BSpline(_), Some(domain)) = (&whole, whole.domain()) {
+            ends = within(ends, domain).ok_or_else(|| entity.wrong("a part within the curve"))?;
         }
-        if matches!(whole, Curve::Ellipse { .. }) && to <= from {
-            to += std::f64::consts::TAU;
-        }
-        Ok(whole.part([from, to]))
+        let part = whole.part(ends);
+        Ok(if is_turned { part.reversed() } else { part })
     }
 
     /// Reads the part of a surface that a rectangle in (u, v) bounds: the whole surface, and the ranges of u and v.
-    pub(super) fn rectangle(&self, entity: &Attributes<'_>) -> Result<(ParametricSurface, [[f64; 2]; 2]), FormatError> {
-        let surface = self.surface(entity.reference(1)?)?;
-        let mut part = [[entity.number_at(2)?, entity.number_at(3)?], [entity.number_at(4)?, entity.number_at(5)?]];
+    pub(super) fn rectangle(
+        &self,
+        entity: &Attributes<'_>,
+        depth: usize,
+    ) -> Result<(OrientedSurface, [[f64; 2]; 2]), FormatError> {
+        let OrientedSurface { surface, mut is_turned } = self.surface_within(entity.reference(1)?, depth + 1)?;
         let (lengths, angles) = (self.units.length_mm, self.units.angle_rad);
-        let [u, v] = match surface {
+        let of_profile = |profile: &Curve| match profile {
+            Curve::Part { whole, .. } if matches!(**whole, Curve::Ellipse { .. }) => angles,
+            Curve::Ellipse { .. } => angles,
+            _ => 1.0,
+        };
+        let units = match &surface {
             ParametricSurface::Plane { .. } => [lengths; 2],
             ParametricSurface::Cylinder { .. } | ParametricSurface::Cone { .. } => [angles, lengths],
             ParametricSurface::Sphere { .. } | ParametricSurface::Torus { .. } => [angles; 2],
-            ParametricSurface::Revolution { .. } => [angles, 1.0],
-            ParametricSurface::BSpline(_) | ParametricSurface::Extrusion { .. } => [1.0; 2],
+            ParametricSurface::Revolution { profile, .. } => [angles, of_profile(profile)],
+            ParametricSurface::Extrusion { profile, .. } => [of_profile(profile), 1.0],
+            ParametricSurface::BSpline(_) => [1.0; 2],
         };
-        for (range, unit) in part.iter_mut().zip([u, v]) {
-            *range = range.map(|t| t * unit);
-            range.sort_by(f64::total_cmp);
+        let period = surface.period();
+        let of_spline = |profile: &Curve| profile.domain().filter(|_| !matches!(profile, Curve::Ellipse { .. }));
+        let domains = match &surface {
+            ParametricSurface::BSpline(surface) => surface.knots().map(|knots| Some(knots.domain())),
+            ParametricSurface::Revolution { profile, .. } => [None, of_spline(profile)],
+            ParametricSurface::Extrusion { profile, .. } => [of_spline(profile), None],
+            _ => [None; 2],
+        };
+        let mut part = [[0.0; 2]; 2];
+        for k in 0..2 {
+            let ends = [entity.number_at(2 + 2 * k)? * units[k], entity.number_at(3 + 2 * k)? * units[k]];
+            let is_upwards = entity.logical(6 + k)?.unwrap_or(true);
+            is_turned ^= !is_upwards;
+            part[k] = part_range(ends, period[k], is_upwards);
+            if let Some(domain) = domains[k] {
+                part[k] = within(part[k], domain).ok_or_else(|| entity.wrong("a part within the surface"))?;
+            }
         }
-        Ok((surface, part))
+        Ok((OrientedSurface { surface, is_turned }, part))
     }
 
     fn spline_curve(&self, entity: &Attributes<'_>) -> Result<BSplineCurve, FormatError> {
@@ -303,25 +337,42 @@ impl<'a> Geometry<'a> {
             None => implied_knots(entity, degree, points.len()),
         };
         let knots = knots.ok_or_else(|| entity.wrong("knots with their multiplicities"))?;
-        let weights = entity.values_of("RATIONAL_B_SPLINE_CURVE").and_then(<[Value]>::first).and_then(as_numbers);
-        BSplineCurve::new(degree, knots, &points, &weights.unwrap_or_default())
+        let weights = match entity.values_of("RATIONAL_B_SPLINE_CURVE") {
+            None => Vec::new(),
+            Some(values) => {
+                let weights = values.first().and_then(as_numbers).filter(|weights| weights.len() == points.len());
+                weights.ok_or_else(|| entity.wrong("as many weights as control points"))?
+            }
+        };
+        BSplineCurve::new(degree, knots, &points, &weights)
             .map_err(|error| entity.wrong(&format!("a valid B-spline: {error}")))
     }
 
-    /// Reads a surface.
-    pub(super) fn surface(&self, number: u64) -> Result<ParametricSurface, FormatError> {
+    /// Reads a surface, and whether its sides are exchanged in the file.
+    pub(super) fn oriented_surface(&self, number: u64) -> Result<OrientedSurface, FormatError> {
+        self.surface_within(number, 0)
+    }
+
+    fn surface_within(&self, number: u64, depth: usize) -> Result<OrientedSurface, FormatError> {
         let entity = self.entity(number)?;
+        if depth > 8 {
+            return Err(entity.wrong("a surface that is not made of itself"));
+        }
+        if entity.name() == "RECTANGULAR_TRIMMED_SURFACE" {
+            return self.rectangle(&entity, depth).map(|(surface, _)| surface);
+        }
+        Ok(OrientedSurface { surface: self.whole_surface(&entity)?, is_turned: false })
+    }
+
+    fn whole_surface(&self, entity: &Attributes<'_>) -> Result<ParametricSurface, FormatError> {
         if entity.has("B_SPLINE_SURFACE") || is_spline_surface(entity.name()) {
-            return self.spline_surface(&entity).map(ParametricSurface::BSpline);
+            return self.spline_surface(entity).map(ParametricSurface::BSpline);
         }
         let frame = || self.frame(entity.reference(1)?);
-        if entity.name() == "RECTANGULAR_TRIMMED_SURFACE" {
-            return self.rectangle(&entity).map(|(surface, _)| surface);
-        }
         Ok(match entity.name() {
             "PLANE" => ParametricSurface::Plane { frame: frame()? },
             "CYLINDRICAL_SURFACE" => {
-                ParametricSurface::Cylinder { frame: frame()?, radius_mm: self.length(&entity, 2)? }
+                ParametricSurface::Cylinder { frame: frame()?, radius_mm: self.length(entity, 2)? }
             }
             "CONICAL_SURFACE" => {
                 let angle = entity.number_at(3)? * self.units.angle_rad;
@@ -331,11 +382,11 @@ impl<'a> Geometry<'a> {
                 }
                 ParametricSurface::Cone { frame: frame()?, radius_mm, half_angle_rad: angle }
             }
-            "SPHERICAL_SURFACE" => ParametricSurface::Sphere { frame: frame()?, radius_mm: self.length(&entity, 2)? },
+            "SPHERICAL_SURFACE" => ParametricSurface::Sphere { frame: frame()?, radius_mm: self.length(entity, 2)? },
             "TOROIDAL_SURFACE" | "DEGENERATE_TOROIDAL_SURFACE" => ParametricSurface::Torus {
                 frame: frame()?,
-                major_radius_mm: self.length(&entity, 2)?,
-                minor_radius_mm: self.length(&entity, 3)?,
+                major_radius_mm: self.length(entity, 2)?,
+                minor_radius_mm: self.length(entity, 3)?,
             },
             "SURFACE_OF_REVOLUTION" => {
                 let (origin, axis) = self.axis(entity.reference(2)?)?;
@@ -392,6 +443,24 @@ impl<'a> Geometry<'a> {
         };
         spline().map_err(|error| entity.wrong(&format!("a valid B-spline: {error}")))
     }
+}
+
+/// Returns the range of a parameter from one end to the other: upwards, or downwards. A parameter with a period goes on
+/// where it repeats.
+fn part_range([from, to]: [f64; 2], period: f64, is_upwards: bool) -> [f64; 2] {
+    let [low, high] = if is_upwards { [from, to] } else { [to, from] };
+    if period.is_finite() && high <= low {
+        let turns = ((low - high) / period).floor() + 1.0;
+        return [low, high + turns * period];
+    }
+    [low.min(high), low.max(high)]
+}
+
+/// Returns the part of a range that is in `domain`. Returns `None` if more than rounding lies outside, because the
+/// polynomials of a spline go on there.
+fn within([low, high]: [f64; 2], domain: [f64; 2]) -> Option<[f64; 2]> {
+    let small = 1e-9 * (domain[1] - domain[0]);
+    (low >= domain[0] - small && high <= domain[1] + small).then(|| [low.max(domain[0]), high.min(domain[1])])
 }
 
 fn is_spline_curve(name: &str) -> bool {

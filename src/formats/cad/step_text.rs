@@ -1,5 +1,6 @@
 //! Text of a STEP file (ISO 10303-21): its entities by number, and their values.
 
+use std::cell::OnceCell;
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -48,6 +49,8 @@ pub(super) struct StepText<'a> {
     places: HashMap<u64, usize>,
     /// The numbers in the order of the file.
     order: Vec<u64>,
+    /// Where the lines end, found when the first error needs it.
+    line_ends: OnceCell<Vec<usize>>,
 }
 
 impl<'a> StepText<'a> {
@@ -56,7 +59,7 @@ impl<'a> StepText<'a> {
     /// # Errors
     /// Text that is not STEP; an entity that is not complete; a number that is given twice.
     pub(super) fn new(path: &'a Path, bytes: &'a [u8]) -> Result<Self, FormatError> {
-        let mut text = Self { path, bytes, places: HashMap::new(), order: Vec::new() };
+        let mut text = Self { path, bytes, places: HashMap::new(), order: Vec::new(), line_ends: OnceCell::new() };
         let mut cursor = Cursor { path, bytes, at: 0 };
         cursor.skip_mark();
         cursor.expect_word("ISO-10303-21")?;
@@ -154,7 +157,9 @@ impl<'a> StepText<'a> {
 
     /// Creates the error that an entity is not as expected.
     pub(super) fn unexpected(&self, number: u64, expected: &str, found: &str) -> FormatError {
-        let line = self.places.get(&number).map(|&at| line_of(self.bytes, at));
+        let ends = || self.bytes.iter().enumerate().filter(|(_, b)| **b == b'\n').map(|(at, _)| at).collect();
+        let line_of = |at: usize| 1 + self.line_ends.get_or_init(ends).partition_point(|end| *end < at);
+        let line = self.places.get(&number).map(|&at| line_of(at));
         let place = line.map_or_else(|| format!("entity #{number}"), |line| format!("line {line}, entity #{number}"));
         FormatError::Unexpected {
             path: self.path.to_owned(),

@@ -212,6 +212,13 @@ impl BSplineCurve {
         let second = (part(2) - first * (2.0 * sums[1][3]) - point * sums[2][3]) / sums[0][3];
         (point.into(), first, second)
     }
+
+    /// Returns the same curve with the parameter -t in place of t.
+    pub(super) fn reversed(&self) -> Self {
+        let values = self.knots.values.iter().rev().map(|knot| -knot).collect();
+        let knots = Knots { degree: self.knots.degree, values };
+        Self { knots, controls: self.controls.iter().rev().copied().collect() }
+    }
 }
 
 /// Tensor-product B-spline surface.

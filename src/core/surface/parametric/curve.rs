@@ -76,6 +76,28 @@ impl Curve {
         Self::Part { whole: Box::new(self), ends }
     }
 
+    /// Returns the same curve with the parameter -t in place of t.
+    pub fn reversed(&self) -> Self {
+        let mirrored = |frame: &Frame| {
+            let [x, y, z] = frame.axes;
+            Frame { origin: frame.origin, axes: [x, -y, -z] }
+        };
+        match self {
+            Self::Line { origin, direction } => Self::Line { origin: *origin, direction: -direction },
+            Self::Ellipse { frame, semi_axes_mm } => {
+                Self::Ellipse { frame: mirrored(frame), semi_axes_mm: *semi_axes_mm }
+            }
+            Self::Hyperbola { frame, semi_axes_mm } => {
+                Self::Hyperbola { frame: mirrored(frame), semi_axes_mm: *semi_axes_mm }
+            }
+            Self::Parabola { frame, focal_mm } => Self::Parabola { frame: mirrored(frame), focal_mm: *focal_mm },
+            Self::BSpline(curve) => Self::BSpline(curve.reversed()),
+            Self::Part { whole, ends: [low, high] } => {
+                Self::Part { whole: Box::new(whole.reversed()), ends: [-high, -low] }
+            }
+        }
+    }
+
     /// Returns the first and the last parameter: the domain of a B-spline, one turn of an ellipse. Returns `None` for a
     /// curve without ends.
     pub fn domain(&self) -> Option<[f64; 2]> {
@@ -88,7 +110,7 @@ impl Curve {
     }
 
     /// Returns the length after which the parameter repeats; infinite for a curve that is not closed.
-    pub(super) fn period(&self) -> f64 {
+    pub fn period(&self) -> f64 {
         match self {
             Self::Ellipse { .. } => std::f64::consts::TAU,
             Self::Part { whole, ends: [low, high] } if high - low >= whole.period() * (1.0 - 1e-12) => whole.period(),
@@ -225,6 +247,21 @@ mod tests {
             Curve::Parabola { frame: frame(), focal_mm: 1.5 },
             Curve::BSpline(BSplineCurve::new(3, knots, &points, &[1.0, 2.0, 0.5, 1.0, 3.0]).unwrap()),
         ]
+    }
+
+    #[test]
+    fn reversed_curve_has_negative_parameter() {
+        let part = curves()[4].clone().part([0.1, 0.8]);
+        for curve in curves().into_iter().chain([part]) {
+            let reversed = curve.reversed();
+            for t in [0.1, 0.25, 0.3, 0.75] {
+                let ((p, first, second), (q, back, other)) = (curve.evaluate(t), reversed.evaluate(-t));
+                assert!((p - q).norm() < 1e-14 && (first + back).norm() < 1e-12 && (second - other).norm() < 1e-11);
+            }
+            if let (Some([low, high]), false) = (curve.domain(), matches!(curve, Curve::Ellipse { .. })) {
+                assert_eq!(reversed.domain(), Some([-high, -low]));
+            }
+        }
     }
 
     #[test]

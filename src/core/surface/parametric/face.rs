@@ -138,29 +138,34 @@ impl Face {
 
     /// Returns the area in mm^2, within about a per cent.
     pub fn area_mm2(&self) -> f64 {
+        area_mm2(&self.enclosed_patches())
+    }
+
+    /// Returns small patches of the surface, those that the outlines enclose.
+    fn enclosed_patches(&self) -> Vec<SmallPatch> {
         let (trimmed, domain) = self.trimmed_domain();
-        let area = |trimmed: &TrimmedDomain| -> f64 {
+        let enclosed = |trimmed: &TrimmedDomain| -> Vec<SmallPatch> {
             let inside = |bounds| self.patches(bounds, trimmed);
             // Once over all of the domain, and once over the box of what is enclosed.
             let wide = trimmed.bounds(domain);
             let found = [0, 1].map(|k| range(inside(wide).map(|patch| patch.at[k])));
             if found[0][0] > found[0][1] {
-                return 0.0;
+                return Vec::new();
             }
             let cell = [0, 1].map(|k| (wide[k][1] - wide[k][0]) / PATCHES as f64);
             let narrow =
                 [0, 1].map(|k| [(found[k][0] - cell[k]).max(wide[k][0]), (found[k][1] + cell[k]).min(wide[k][1])]);
-            inside(narrow).map(|patch| patch.area_mm2).sum()
+            inside(narrow).collect()
         };
-        let found = area(&trimmed);
+        let found = enclosed(&trimmed);
         if !trimmed.is_ambiguous() {
             return found;
         }
         // A ring on a sphere has a small and a large side; a face of an optic is the small one.
-        let other = area(&trimmed.inverted());
-        let (small, large) = (found.min(other), found.max(other));
+        let other = enclosed(&trimmed.inverted());
+        let (small, large) = if area_mm2(&found) <= area_mm2(&other) { (found, other) } else { (other, found) };
         // A ring at the end of the domain has nothing on its other side.
-        if small > 1e-3 * large { small } else { large }
+        if area_mm2(&small) > 1e-3 * area_mm2(&large) { small } else { large }
     }
 
     /// Returns the part of (u, v) that the face has, and the domain around it.
@@ -168,10 +173,12 @@ impl Face {
         TrimmedDomain::of_outlines(&self.surface, &self.all_outlines())
     }
 
-    /// Returns the corners of the box along the axes of the file that contains the outlines.
+    /// Returns the corners of the box along the axes of the file that contains the face.
     pub fn bounds(&self) -> [Point; 2] {
         let start = [Point::from(Vector::repeat(f64::INFINITY)), Point::from(Vector::repeat(f64::NEG_INFINITY))];
-        self.all_outlines().iter().flatten().fold(start, |[low, high], p| [low.inf(p), high.sup(p)])
+        let patches = self.enclosed_patches().into_iter().map(|patch| patch.point);
+        let places = self.all_outlines().into_iter().flatten().chain(patches);
+        places.fold(start, |[low, high], p| [low.inf(&p), high.sup(&p)])
     }
 
     /// Returns the face as a nominal surface in a frame. `aperture` replaces the outline of the face; it is in the frame
@@ -344,6 +351,10 @@ fn own_rotation(normal: &Vector) -> Matrix3<f64> {
     }
     let half_turn = Matrix3::from_diagonal(&Vector::new(1.0, -1.0, -1.0));
     half_turn * min_rotation(&(half_turn * normal))
+}
+
+fn area_mm2(patches: &[SmallPatch]) -> f64 {
+    patches.iter().map(|patch| patch.area_mm2).sum()
 }
 
 /// Small part of a surface.

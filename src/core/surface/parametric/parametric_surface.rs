@@ -187,6 +187,28 @@ impl ParametricSurface {
         Self::Revolution { profile, origin, axis }
     }
 
+    /// Returns the lengths after which u and v repeat; infinite for a parameter that does not.
+    pub fn period(&self) -> [f64; 2] {
+        const TURN: f64 = std::f64::consts::TAU;
+        match self {
+            Self::Plane { .. } => [f64::INFINITY; 2],
+            Self::Extrusion { profile, .. } => [profile.period(), f64::INFINITY],
+            Self::Revolution { profile, .. } => [TURN, profile.period()],
+            Self::Torus { .. } => [TURN; 2],
+            Self::BSpline(surface) => {
+                let [u, v] = surface.knots().map(|knots| knots.domain());
+                let place = |u: f64, v: f64| surface.evaluate(u, v).point;
+                let size = (place(u[0], v[0]) - place(0.5 * (u[0] + u[1]), 0.5 * (v[0] + v[1]))).norm();
+                let closes = |a: [Point; 3], b: [Point; 3]| (0..3).all(|i| (a[i] - b[i]).norm() <= 1e-7 * size);
+                let along = |[low, high]: [f64; 2]| [0.2, 0.5, 0.9].map(|t| low + t * (high - low));
+                let in_u = closes(along(v).map(|t| place(u[0], t)), along(v).map(|t| place(u[1], t)));
+                let in_v = closes(along(u).map(|t| place(t, v[0])), along(u).map(|t| place(t, v[1])));
+                [(in_u, u), (in_v, v)].map(|(closes, [low, high])| if closes { high - low } else { f64::INFINITY })
+            }
+            Self::Cylinder { .. } | Self::Cone { .. } | Self::Sphere { .. } => [TURN, f64::INFINITY],
+        }
+    }
+
     /// Returns v of the place where the surface meets its axis, if that is an end that no outline shows: the apex of a
     /// cone, or of a turned line, parabola or hyperbola.
     pub(super) fn apex(&self) -> Option<f64> {

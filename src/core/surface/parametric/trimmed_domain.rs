@@ -38,7 +38,7 @@ impl TrimmedDomain {
 
     /// Maps outlines in space to (u, v). `domain` has the ranges of u and v.
     fn new(surface: &ParametricSurface, domain: [[f64; 2]; 2], outlines: &[Vec<Point>]) -> Self {
-        let period = period(surface, domain);
+        let period = surface.period();
         let mapped = outlines.iter().filter(|outline| outline.len() > 2).map(|outline| {
             let mut places: Vec<[f64; 2]> = Vec::with_capacity(outline.len());
             for p in outline {
@@ -159,27 +159,6 @@ fn unwrapped(t: f64, near: f64, period: f64) -> f64 {
 /// Returns `t` moved by whole periods into its range, if it lies outside.
 pub(super) fn wrapped(t: f64, [low, high]: [f64; 2], period: f64) -> f64 {
     if period.is_finite() && !(low..=high).contains(&t) { low + (t - low).rem_euclid(period) } else { t }
-}
-
-/// Returns the lengths after which the parameters repeat.
-fn period(surface: &ParametricSurface, [u, v]: [[f64; 2]; 2]) -> [f64; 2] {
-    let turn = std::f64::consts::TAU;
-    match surface {
-        ParametricSurface::Plane { .. } => [f64::INFINITY; 2],
-        ParametricSurface::Extrusion { profile, .. } => [profile.period(), f64::INFINITY],
-        ParametricSurface::Revolution { profile, .. } => [turn, profile.period()],
-        ParametricSurface::Torus { .. } => [turn; 2],
-        ParametricSurface::BSpline(_) => {
-            let place = |u: f64, v: f64| surface.evaluate(u, v).point;
-            let size = (place(u[0], v[0]) - place(0.5 * (u[0] + u[1]), 0.5 * (v[0] + v[1]))).norm();
-            let closes = |a: [Point; 3], b: [Point; 3]| (0..3).all(|i| (a[i] - b[i]).norm() <= 1e-7 * size);
-            let along = |[low, high]: [f64; 2]| [0.2, 0.5, 0.9].map(|t| low + t * (high - low));
-            let in_u = closes(along(v).map(|t| place(u[0], t)), along(v).map(|t| place(u[1], t)));
-            let in_v = closes(along(u).map(|t| place(t, v[0])), along(u).map(|t| place(t, v[1])));
-            [(in_u, u), (in_v, v)].map(|(closes, [low, high])| if closes { high - low } else { f64::INFINITY })
-        }
-        _ => [turn, f64::INFINITY],
-    }
 }
 
 /// Returns the parameters of the place of a surface that is nearest to `p`. `near` are those of a place nearby.

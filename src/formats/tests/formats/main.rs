@@ -7,3 +7,4 @@ mod lens;
 mod map_files;
 mod points;
 mod real_files;
+mod step_text;
