@@ -31,7 +31,11 @@ pub(super) fn parse_iges(path: &Path, bytes: &[u8]) -> Result<CadModel, FormatEr
     let is_free = |entry: &&Entry| {
         matches!(entry.kind, 143 | 144 | 510) || (is_surface(entry.kind) && !used.contains(&entry.number))
     };
-    let faces: Vec<CadFace> = text.entries().iter().filter(is_free).map(|entry| reader.face(entry)).collect();
+    let placed = reader.placed();
+    let free: Vec<&Entry> = text.entries().iter().filter(is_free).collect();
+    let is_any_shown = free.iter().any(|entry| !entry.is_hidden);
+    let shown = free.into_iter().filter(|entry| entry.is_hidden != is_any_shown);
+    let faces: Vec<CadFace> = shown.map(|entry| reader.face(entry, &placed)).collect();
     if faces.is_empty() {
         return Err(FormatError::NoData { path: path.to_owned(), expected: "face or surface" });
     }
@@ -83,6 +87,9 @@ fn unit_mm(text: &IgesText<'_>) -> Result<f64, FormatError> {
     match (flagged, named) {
         // 3: the name alone tells.
         (Some(mm), Some(named)) if mm.is_nan() => Ok(named),
+        (Some(mm), Some(named)) if mm != named => {
+            Err(wrong("one unit of length in parameters 14 and 15", format!("{flag}, {name}")))
+        }
         (Some(mm), _) if !mm.is_nan() => Ok(mm),
         _ => Err(wrong("a known unit of length (parameters 14 and 15)", format!("{flag}, {name}"))),
     }
@@ -178,12 +185,35 @@ impl<'a> Reader<'a> {
         used
     }
 
-    fn face(&self, entry: &'a Entry) -> CadFace {
+    /// Returns the entities of subfigures (308) of which an instance (408) is moved or scaled.
+    fn placed(&self) -> HashSet<u64> {
+        let mut placed = HashSet::new();
+        for entry in self.text.entries().iter().filter(|entry| entry.kind == 408) {
+            let Ok(mut taken) = self.parameters_of(entry) else { continue };
+            let place = taken.pointer().and_then(|definition| Ok((definition, taken.point()?, taken.number())));
+            let Ok((definition, shift, scale)) = place else { continue };
+            let is_moved = shift != Point::origin() || !matches!(scale, Ok(1.0) | Err(_)) || entry.transformation != 0;
+            let Ok(mut taken) = self.parameters_of_number(definition) else { continue };
+            // Depth, name, number of entities, and the entities.
+            taken.at = 2;
+            let count = taken.count().unwrap_or(0);
+            if is_moved {
+                placed.extend(taken.numbers(count).unwrap_or_default().into_iter().map(|n| n.abs() as u64));
+            }
+        }
+        placed
+    }
+
+    fn face(&self, entry: &'a Entry, placed: &HashSet<u64>) -> CadFace {
         let surface_number = self.base_surface(entry);
         let kind =
             surface_number.as_ref().ok().and_then(|&n| self.text.entry_of(n).ok()).map_or(entry.kind, |e| e.kind);
         let name = self.name(entry, surface_number.as_ref().ok().copied());
         let read = || {
+            if placed.contains(&entry.number) {
+                let expected = "a face that is not in a placed subfigure; export the model without subfigures";
+                return Err(self.text.wrong(entry.number, expected, "a subfigure (308) that an instance (408) moves"));
+            }
             let surface_number = surface_number?;
             let (surface, natural) = self.surface(surface_number)?;
             let outlines = match entry.kind {

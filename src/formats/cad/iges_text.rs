@@ -18,6 +18,8 @@ pub(super) struct Entry {
     pub form: u64,
     /// Number of the transformation that applies to it; 0 for none.
     pub transformation: u64,
+    /// True if the file says that the entity is not to be shown.
+    pub is_hidden: bool,
     /// Label in the directory; empty if it has none.
     pub label: String,
     /// First line of its parameters, and how many there are.
@@ -109,12 +111,15 @@ impl<'a> IgesText<'a> {
         if first == 0 || end > self.parameter_lines.len() {
             return Err(self.wrong(number, "lines of the parameter section", &format!("{count} lines from {first}")));
         }
-        let label = [field(1, 7), field(1, 8)].map(|part| part.trim_matches('0')).concat();
+        // Label and subscript; a subscript of 0 is none.
+        let label = [field(1, 7), field(1, 8).trim_start_matches('0')].concat();
         Ok(Entry {
             number,
             kind: integer(0, 0)?,
             form: integer(1, 4)?,
             transformation: integer(0, 6)?,
+            // The status number has eight digits; the first two are 01 for an entity that is not shown. Blanks are zeros.
+            is_hidden: lines[0].get(64..66).is_some_and(|digits| digits.ends_with(b"1")),
             label: if field(1, 7).is_empty() { String::new() } else { label },
             lines: [first - 1, end],
         })
@@ -142,6 +147,10 @@ impl<'a> IgesText<'a> {
         let [first, end] = entry.lines;
         let mut text = Vec::with_capacity(PARAMETER_DATA * (end - first));
         for line in &self.parameter_lines[first..end] {
+            let back = std::str::from_utf8(&line[PARAMETER_DATA..DATA]).unwrap_or_default().trim();
+            if !back.is_empty() && back.parse() != Ok(entry.number) {
+                return Err(self.wrong(entry.number, "its own number in columns 66 to 72 of its parameters", back));
+            }
             text.extend_from_slice(&line[..PARAMETER_DATA]);
         }
         let mut parameters = parse_parameters(&text, self.marks)

@@ -20,15 +20,22 @@ pub(super) fn joined_outlines(edges: Vec<EdgePlaces>) -> Option<Vec<Vec<Point>>>
     for edge in &edges {
         *uses.entry(edge.edge).or_default() += 1;
     }
-    let mut rest: Vec<EdgePlaces> = edges.into_iter().filter(|edge| uses[&edge.edge] == 1).collect();
+    let single = edges.into_iter().filter(|edge| uses[&edge.edge] == 1);
+    let mut rest: Vec<Option<EdgePlaces>> = single.map(Some).collect();
+    // Edges by the vertex at their begin, the first of the face last, so that it is the next to be popped.
+    let mut beginning: HashMap<u64, Vec<usize>> = HashMap::new();
+    for (at, edge) in rest.iter().enumerate().rev() {
+        if let Some(edge) = edge {
+            beginning.entry(edge.ends[0]).or_default().push(at);
+        }
+    }
     let mut outlines = Vec::new();
-    while !rest.is_empty() {
-        let first = rest.remove(0);
+    for at in 0..rest.len() {
+        let Some(first) = rest[at].take() else { continue };
         let (begin, mut end) = (first.ends[0], first.ends[1]);
         let mut places = first.places;
         while end != begin {
-            let next = rest.iter().position(|edge| edge.ends[0] == end)?;
-            let edge = rest.remove(next);
+            let edge = next_edge(&mut beginning, &mut rest, end)?;
             end = edge.ends[1];
             places.pop();
             places.extend(edge.places);
@@ -37,6 +44,21 @@ pub(super) fn joined_outlines(edges: Vec<EdgePlaces>) -> Option<Vec<Vec<Point>>>
         outlines.push(places);
     }
     Some(outlines)
+}
+
+/// Takes the first edge that begins at a vertex.
+fn next_edge(
+    beginning: &mut HashMap<u64, Vec<usize>>,
+    rest: &mut [Option<EdgePlaces>],
+    vertex: u64,
+) -> Option<EdgePlaces> {
+    let there = beginning.get_mut(&vertex)?;
+    while let Some(at) = there.pop() {
+        if let Some(edge) = rest[at].take() {
+            return Some(edge);
+        }
+    }
+    None
 }
 
 #[cfg(test)]

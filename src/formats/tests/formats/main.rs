@@ -2,6 +2,7 @@
 
 mod cad;
 mod headers;
+mod iges_text;
 mod instrument_maps;
 mod lens;
 mod map_files;
