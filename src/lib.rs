@@ -12,7 +12,7 @@
 //!
 //!  terminal, page <== control ==> drive     (orders, and how the cell is: one door for all)
 //!
-//!  pure: figures, geometry, surface, measuring, registration, compensation, form, cell: no file, no clock, no randomness, no logging
+//!  pure: figures, geometry, surface, measuring, registration, stitching, compensation, form, cell: no file, no clock, no randomness, no logging
 //! ```
 //!
 //! Each module knows as little as possible: `cell` knows no points, `registration` no machines, `device` no recipes.
@@ -24,7 +24,7 @@
 //! normal, towards the probe.
 
 pub use regrind_cell as cell;
-pub use regrind_core::{compensation, form, geometry, measuring, model, registration, surface};
+pub use regrind_core::{compensation, form, geometry, measuring, model, registration, stitching, surface};
 pub use regrind_device as device;
 pub use regrind_document as document;
 pub use regrind_figures as figures;

@@ -44,6 +44,10 @@ pub(super) enum Failure {
     NoProbeRadius,
     #[error("{path}: a map has points of the surface, not centres of a probe; give --method contact")]
     MapOfContacts { path: PathBuf },
+    #[error("there are {maps} --measured and {places} --place; give one pose for each map, in the same order, or none")]
+    Places { maps: usize, places: usize },
+    #[error("{path}: {source}")]
+    Stitching { path: PathBuf, source: regrind::stitching::StitchingError },
     #[error("{path}: --projection applies only to points, but this file is {what}; remove --projection")]
     Projection { path: PathBuf, what: &'static str },
     #[error(

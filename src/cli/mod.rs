@@ -12,6 +12,7 @@ mod doctor;
 mod face_list;
 mod failure;
 mod file_kind;
+mod fit_arguments;
 mod init;
 mod initial;
 mod key;
@@ -38,6 +39,7 @@ mod show;
 mod simulate;
 mod simulated;
 mod states;
+mod stitch;
 mod succession;
 mod terminal;
 mod truth;
@@ -100,6 +102,7 @@ enum Command {
     Audit(audit::Arguments),
     Report(report::Arguments),
     Register(register::Arguments),
+    Stitch(stitch::Arguments),
     Accuracy(accuracy::Arguments),
     Compensate(compensate::Arguments),
     Check(check::Arguments),
@@ -151,6 +154,7 @@ fn run() -> ExitCode {
         Command::Audit(arguments) => audit::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Register(arguments) => register::run(&arguments),
+        Command::Stitch(arguments) => stitch::run(&arguments),
         Command::Accuracy(arguments) => accuracy::run(&arguments),
         Command::Compensate(arguments) => compensate::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),

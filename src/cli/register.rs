@@ -7,20 +7,19 @@ use clap::Args;
 use regrind::figures::Interval;
 use regrind::formats::run_files::CycleFile;
 use regrind::formats::{
-    Alternative, Columns, NominalInput, NotedPoints, RegistrationDocument, ResultFolder, Table, Unit, is_map,
-    read_measured_with_notes, save_form, save_registration,
+    Alternative, NominalInput, NotedPoints, RegistrationDocument, ResultFolder, read_measured_with_notes, save_form,
+    save_registration,
 };
 use regrind::geometry::Pose;
 use regrind::model::{AngleInterval, Form, IsoFigures, ModelInputs, SlopeFigures};
-use regrind::registration::{Coordinate, Loss, Method, ProbeSide, RegistrationOptions, Start, register};
-use regrind::surface::{DistanceModel, Nominal, PlaneProjection};
+use regrind::registration::register;
+use regrind::surface::Nominal;
 
-use super::choice::word_of;
+use super::Outcome;
 use super::failure::Failure;
-use super::initial::read_pose;
+use super::fit_arguments::{FitArguments, MeasuredTable};
 use super::nominal::{self, NominalTable, kind_in_words};
 use super::words::{count, counted, three_digits};
-use super::{Outcome, above_zero, finite_above_zero, finite_from_zero};
 
 /// Register measured probe centres to the offset of a nominal surface
 #[derive(Args, Debug)]
@@ -33,52 +32,15 @@ pub(super) struct Arguments {
     /// Measured points as text or PLY, in mm, or an interferometer's or profilometer's map (X3P, SDF, MetroPro, datx, sur, opd, opdx, al3d and others)
     #[arg(long, value_name = "FILE")]
     measured: PathBuf,
-    /// Columns of the measured table, by name or by number from 1, if its header does not identify them
-    #[arg(long, value_name = "x=X_act,y=Y_act,z=Z_act")]
-    columns: Option<Columns>,
-    /// Unit of the measured table: mm, um, nm, cm, m or inch
-    #[arg(long)]
-    unit: Option<Unit>,
-    /// Unit of z in the measured table, if it differs from that of x and y
-    #[arg(long, value_name = "UNIT")]
-    height_unit: Option<Unit>,
+    #[command(flatten)]
+    table: MeasuredTable,
     #[command(flatten)]
     of_nominal: NominalTable,
-    /// Radius of the probe in mm; 0 for a probe without a ball, such as an optical one. Not needed with --method
-    /// contact
-    #[arg(long, alias = "probe-radius-mm", value_name = "MM", allow_negative_numbers = true, value_parser = finite_from_zero)]
-    probe_radius: Option<f64>,
     /// Folder for the results; created if absent
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Shape of the surface between the nominal points
-    #[arg(long, value_parser = word_of::<DistanceModel>(), default_value = "curved")]
-    distance: DistanceModel,
-    /// Meaning of the measured points
-    #[arg(long, value_parser = word_of::<Method>(), default_value = "offset")]
-    method: Method,
-    /// Projection of scattered nominal points for the triangulation
-    #[arg(long, value_parser = word_of::<PlaneProjection>(), default_value = "auto")]
-    projection: PlaneProjection,
-    /// Locked directions of the pose, separated by commas: they keep their values from --initial, or zero, and no
-    /// search is made
-    #[arg(long, value_parser = word_of::<Coordinate>(), value_delimiter = ',', value_name = "x,y,z,rx,ry,rz")]
-    lock: Vec<Coordinate>,
-    /// Loss function of the distance of a point
-    #[arg(long, value_parser = word_of::<Loss>(), default_value = "none")]
-    loss: Loss,
-    /// Start at this pose cmm_from_model instead of searching for one
-    #[arg(long, value_name = "FILE")]
-    initial: Option<PathBuf>,
-    /// Side of the nominal surface on which the probe is
-    #[arg(long, value_parser = word_of::<ProbeSide>(), default_value = "auto")]
-    side: ProbeSide,
-    /// Maximum rms deviation, in mm; a fit with a larger one is refused
-    #[arg(long, value_name = "MM", allow_negative_numbers = true, value_parser = finite_above_zero)]
-    max_rms: Option<f64>,
-    /// Reject points farther off than this many robust standard deviations as outliers; `inf` keeps all
-    #[arg(long, value_name = "N", default_value_t = 6.0, allow_negative_numbers = true, value_parser = above_zero)]
-    outlier_sigmas: f64,
+    #[command(flatten)]
+    fit: FitArguments,
     /// Separate the form from the noise of the probe, with the uncertainties of both: model.json and form.csv
     #[arg(long)]
     model: bool,
@@ -109,7 +71,7 @@ of points. `outliers` and `off_part` are indices of measured points, from 0.
 Exit codes: 0 registered; 2 bad arguments or data; 3 fault.";
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let options = options(arguments)?;
+    let options = arguments.fit.options()?;
     let folder = ResultFolder::prepare(&arguments.out)?;
     let ((nominal, choice), measured) = read_inputs(arguments)?;
     let mut registration = register(&nominal, &measured.points, &options)
@@ -138,49 +100,15 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Returns the method of the registration. The method is [`Method::Contact`] (the measured points lie on the surface
-/// itself) if the arguments give a probe radius of 0. Otherwise the method is the one that the arguments name.
-fn method(arguments: &Arguments) -> Method {
-    if arguments.probe_radius == Some(0.0) { Method::Contact } else { arguments.method }
-}
-
-fn options(arguments: &Arguments) -> Result<RegistrationOptions, Failure> {
-    let method = method(arguments);
-    let radius_mm = match (arguments.probe_radius, method) {
-        (Some(radius_mm), _) => radius_mm,
-        (None, Method::Contact) => 0.0,
-        (None, _) => return Err(Failure::NoProbeRadius),
-    };
-    Ok(RegistrationOptions {
-        method,
-        distance_model: arguments.distance,
-        loss: arguments.loss,
-        side: arguments.side,
-        locked: Coordinate::locked_flags(&arguments.lock),
-        start: match &arguments.initial {
-            Some(path) => Start::Pose(read_pose(path)?),
-            None if arguments.lock.is_empty() => Start::Search,
-            // A search would choose the locked coordinates at random.
-            None => Start::Pose(Pose::identity()),
-        },
-        outlier_sigmas: arguments.outlier_sigmas,
-        rms_limit_mm: arguments.max_rms,
-        ..RegistrationOptions::new(radius_mm)
-    })
-}
-
 /// Reads the nominal file and the measured file that `arguments` name, in parallel. Returns the nominal surface with
 /// the words that say which of several it is, and the measured points. The points contain notes about doubtful lines, for example a last line without a line end.
 ///
 /// Returns an error if a file is invalid. Also returns an error if the measured file is a height map (X3P, SDF or
 /// MetroPro) and the method of the registration is not `Contact`.
 fn read_inputs(arguments: &Arguments) -> Result<((Nominal, Option<String>), NotedPoints), Failure> {
-    let (path, projection) = (&arguments.nominal, arguments.projection);
-    if is_map(&arguments.measured)? && method(arguments) != Method::Contact {
-        return Err(Failure::MapOfContacts { path: arguments.measured.clone() });
-    }
-    let of_measured =
-        Table { columns: arguments.columns.clone(), unit: arguments.unit, height_unit: arguments.height_unit };
+    let (path, projection) = (&arguments.nominal, arguments.fit.projection);
+    arguments.fit.check_is_fit_for(&arguments.measured)?;
+    let of_measured = arguments.table.table();
     std::thread::scope(|scope| {
         let nominal = scope.spawn(|| nominal::surface(path, projection, &arguments.of_nominal));
         let measured = read_measured_with_notes(&arguments.measured, &of_measured);

@@ -4,6 +4,7 @@
 //!  nominal ---> surface ----+
 //!                           +--> registration --> compensation --> error map, correction, path of the wheel
 //!  probe's centres ---------+          |
+//!  (stitching: several maps at once)   |
 //!  (measuring: where to touch)         +--> form: residual error of the part
 //! ```
 //!
@@ -50,4 +51,5 @@ pub mod measuring;
 pub mod model;
 pub mod registration;
 mod sparse;
+pub mod stitching;
 pub mod surface;

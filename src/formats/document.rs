@@ -68,6 +68,13 @@ pub struct ProgramVersion {
     pub version: &'static str,
 }
 
+impl ProgramVersion {
+    /// Returns the name and the version of this program.
+    pub(super) fn this() -> Self {
+        Self { name: "regrind", version: env!("CARGO_PKG_VERSION") }
+    }
+}
+
 /// Nominal surface of the registration.
 #[derive(Serialize)]
 #[allow(missing_docs)]
@@ -137,7 +144,7 @@ impl<'a> RegistrationDocument<'a> {
             |(pose, rms_mm): &(Pose, f64)| Alternative { cmm_from_model: pose.to_rows(), rms_mm: *rms_mm };
         let names = ["x", "y", "z", "rx", "ry", "rz"];
         Self {
-            program: ProgramVersion { name: "regrind", version: env!("CARGO_PKG_VERSION") },
+            program: ProgramVersion::this(),
             simulation: None,
             nominal,
             measured: MeasuredInput { file: measured_file },

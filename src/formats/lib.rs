@@ -39,7 +39,8 @@ mod result_content;
 pub mod run_files;
 mod scanner_cloud;
 pub mod sdf;
-pub mod stl;
+pub mod stitching_document;
+mod stl;
 mod system;
 mod unit;
 mod uploaded_file;
@@ -81,6 +82,7 @@ pub use registration::{
 };
 pub use scanner_cloud::parse_scanner_cloud;
 pub use sdf::{parse_sdf, read_sdf};
+pub use stitching_document::{StitchingDocument, save_stitching};
 pub use stl::{StlFile, parse_stl, read_stl};
 pub use system::{OpenToOthers, is_same_file, readable_by_others, user_name};
 pub use unit::Unit;

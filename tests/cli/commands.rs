@@ -330,6 +330,43 @@ fn register_prints_json_or_text() {
     }
 }
 
+/// Two halves of a cloud, one of them in a frame of its own, are stitched.
+#[test]
+fn stitch_writes_poses_and_seams() {
+    let bench = Bench::new();
+    let points = nominal();
+    let half = |keep: &dyn Fn(f64) -> bool, step: usize, shift_mm: f64| {
+        let kept = points.iter().filter(|p| keep(p[0])).step_by(step);
+        let moved: Vec<Vec3> = kept.map(|[x, y, z]| [x + shift_mm, y - shift_mm, z + shift_mm]).collect();
+        rows(&moved, ",")
+    };
+    bench.write("left.csv", half(&|x| x < 8.0, 3, 0.0));
+    bench.write("right.csv", half(&|x| x > -8.0, 5, 0.05));
+    bench.write("same.txt", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1");
+    let stitch = |more: &[&str]| {
+        let mut arguments = vec!["stitch", "--nominal", "nominal.csv", "--method", "contact", "--out", "out/here"];
+        arguments.extend(["--measured", "left.csv", "--measured", "right.csv"]);
+        arguments.extend(more);
+        bench.run(&arguments)
+    };
+    bench.assert_refused(&stitch(&["--place", "same.txt"]), &["--place"]);
+    bench.assert_refused(&stitch(&["--measured", "left.csv"]), &["repeat"]);
+    let output = stitch(&["--place", "same.txt", "--place", "same.txt", "--json"]);
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    let printed: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let written: Value = serde_json::from_slice(&fs::read(bench.path("out/here/stitching.json")).unwrap()).unwrap();
+    assert_eq!(printed, written);
+    let shift = |map: usize, k: usize| number(&written["maps"][map]["common_from_map"][k][3]);
+    for (k, expected) in [-0.05, 0.05, -0.05].into_iter().enumerate() {
+        assert!((shift(1, k) - shift(0, k) - expected).abs() < 1e-3, "{k}: {}", shift(1, k) - shift(0, k));
+    }
+    assert_eq!(written["covariance"].as_array().unwrap().len(), 12);
+    assert_eq!(written["seams"].as_array().unwrap().len(), 1);
+    assert_eq!(numbers(&written["seams"][0]["maps"]), [1.0, 2.0]);
+    let lines = |name: &str| text(&fs::read(bench.path(&format!("out/here/{name}"))).unwrap()).lines().count();
+    assert_eq!(lines("stitched.csv"), lines("deviations.csv"));
+}
+
 #[test]
 fn register_accepts_every_option() {
     let bench = Bench::new();

@@ -11,12 +11,13 @@ use std::path::{Path, PathBuf};
 
 /// Every room, its folder or file, and the rooms that it may name. A dependency that is not in a line here points in
 /// the wrong direction.
-const ARROWS: [(&str, &str, &[&str]); 28] = [
+const ARROWS: [(&str, &str, &[&str]); 29] = [
     ("figures", "src/figures", &[]),
     ("geometry", "src/core/geometry", &[]),
     ("surface", "src/core/surface", &["geometry"]),
     ("measuring", "src/core/measuring", &["geometry", "surface"]),
     ("registration", "src/core/registration", &["geometry", "surface"]),
+    ("stitching", "src/core/stitching", &["geometry", "registration", "surface"]),
     ("compensation", "src/core/compensation", &["geometry", "sparse", "surface", "registration", "model"]),
     ("model", "src/core/model", &["form", "geometry", "registration", "sparse"]),
     ("sparse", "src/core/sparse.rs", &[]),
@@ -62,7 +63,8 @@ const ARROWS: [(&str, &str, &[&str]); 28] = [
 ];
 
 /// The rooms of the numerical core.
-const CORE: [&str; 7] = ["geometry", "surface", "measuring", "registration", "compensation", "form", "model"];
+const CORE: [&str; 8] =
+    ["geometry", "surface", "measuring", "registration", "compensation", "form", "model", "stitching"];
 
 /// Files that may name an operating system, with the code that is specific to it: twins with the same functions, and
 /// the code that chooses between them.

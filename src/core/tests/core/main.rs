@@ -17,4 +17,5 @@ mod part_priors;
 mod part_shapes;
 mod plausibility;
 mod search;
+mod stitching;
 mod stopping;
