@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{Bytes, length_mm, map_from_top, read_with};
+use super::{Bytes, checked_factor, length_mm, map_from_top, read_with};
 
 const MAGIC: &[u8] = b"VCA DATA\x01\x00\x00\x55";
 const MAX_DEPTH: usize = 32;
@@ -62,13 +62,21 @@ fn parse_bruker(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     let quantity_mm = |key: &str| match item(&name(key)) {
         Some(Value::Quantity { value, symbol }) => {
             let unit = length_mm(symbol).ok_or_else(|| file.unexpected(&name(key), "a unit of length", symbol))?;
-            Ok(value * unit)
+            Ok(unit * checked_factor(path, &name(key), "a quantity", *value)?)
         }
         _ => Err(file.unexpected(&name(key), "a quantity", "none")),
     };
+    if columns < 2 || rows < 2 {
+        // An extent of 0 says nothing of the distance of samples.
+        return Err(file.unexpected(
+            &name("Matrix"),
+            "two columns and two rows, or more",
+            format!("{columns} x {rows}"),
+        ));
+    }
     // Extents are from the first sample to the last.
-    let pitch = |extent: f64, count: usize| if count > 1 { extent / (count - 1) as f64 } else { 0.0 };
-    let spacing_mm = [pitch(quantity_mm("Dimension2Extent")?, columns), pitch(quantity_mm("Dimension1Extent")?, rows)];
+    let pitch = |key: &str, count: usize| Ok(quantity_mm(key)? / (count - 1) as f64);
+    let spacing_mm = [pitch("Dimension2Extent", columns)?, pitch("Dimension1Extent", rows)?];
     let scale_mm = quantity_mm("DataScale")?;
     map_from_top(path, [columns, rows], spacing_mm, |index| {
         let value = f64::from(file.f32(begin + 4 * index).ok()?);

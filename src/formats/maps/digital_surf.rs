@@ -8,7 +8,10 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{Bytes, length_mm, map_from_top, read_with};
+use super::{Bytes, checked_factor, length_mm, map_from_top, read_with};
+
+/// Places of the steps along x, y and z.
+const STEPS: [&str; 3] = ["step of x (byte 120)", "step of y (byte 124)", "step of z (byte 128)"];
 
 const HEADER: usize = 512;
 const PLAIN: &[u8] = b"DIGITAL SURF";
@@ -52,9 +55,13 @@ fn parse_digital_surf(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatErro
         let unit = unit(file.slice(180 + 16 * k, 16)?);
         units[k] =
             length_mm(&unit).ok_or_else(|| file.unexpected("unit of a step (byte 180)", "a unit of length", unit))?;
-        steps_mm[k] = f64::from(file.f32(120 + 4 * k)?) * units[k];
+        let step = f64::from(file.f32(120 + 4 * k)?);
+        steps_mm[k] = units[k] * checked_factor(path, STEPS[k], "a step", step)?;
     }
     let offset_mm = f64::from(file.f32(474)?) * units[2];
+    if !offset_mm.is_finite() {
+        return Err(file.unexpected("offset of z (byte 474)", "a finite number", file.f32(474)?.to_string()));
+    }
     let begin = HEADER + usize::from(file.u16(334)?) + usize::from(file.u16(336)?);
     let length = columns * rows * usize::from(bits.unsigned_abs()) / 8;
     let unpacked;

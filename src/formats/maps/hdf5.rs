@@ -10,7 +10,7 @@ use hdf5_reader::{Dataset, Hdf5File, OpenOptions};
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MAX_SAMPLES, MapFormat, check_size};
 use super::hdf5_value::{Value, attribute, numbers, table};
-use super::{length_mm, map_from_top, read_with, unexpected};
+use super::{checked_factor, length_mm, map_from_top, read_with, unexpected};
 
 const MAGIC: &[u8] = b"\x89HDF\r\n\x1a\n";
 
@@ -61,12 +61,12 @@ fn zygo_mx(path: &Path, file: &Hdf5File) -> Result<HeightMap, FormatError> {
     if let Some(other) = z_unit.filter(|other| *other != unit) {
         return Err(unexpected(path, &place, &format!("the unit of Unit and of Z Converter alike ({unit})"), other));
     }
-    let wavelength_mm = || attributes.number("Wavelength").map(|wavelength_m| 1e3 * wavelength_m);
+    let wavelength_mm = || attributes.factor("Wavelength").map(|wavelength_m| 1e3 * wavelength_m);
     let unit_mm = match unit {
         "Fringes" => {
             let obliquity =
-                if attributes.has("Obliquity Factor") { attributes.number("Obliquity Factor")? } else { 1.0 };
-            wavelength_mm()? * attributes.number("Interferometric Scale Factor")? * obliquity
+                if attributes.has("Obliquity Factor") { attributes.factor("Obliquity Factor")? } else { 1.0 };
+            wavelength_mm()? * attributes.factor("Interferometric Scale Factor")? * obliquity
         }
         "Waves" => wavelength_mm()?,
         other => length_mm(other).ok_or_else(|| unexpected(path, &place, "a surface in a unit of length", other))?,
@@ -168,8 +168,13 @@ impl Attributes<'_> {
     }
 
     fn number(&self, name: &str) -> Result<f64, FormatError> {
-        let number = self.get(name)?.as_ref().and_then(Value::number).filter(|number| number.is_finite());
+        let number = self.get(name)?.as_ref().and_then(Value::number);
         number.ok_or_else(|| unexpected(self.path, &self.name, &format!("a number in the attribute {name}"), "none"))
+    }
+
+    /// Returns a number that lengths are multiplied by.
+    fn factor(&self, name: &str) -> Result<f64, FormatError> {
+        checked_factor(self.path, &format!("{}, {name}", self.name), "a number", self.number(name)?)
     }
 
     /// Returns the distance of the samples that a converter states: its second parameter, in metres.

@@ -88,6 +88,14 @@ fn unexpected(path: &Path, place: &str, expected: &str, found: impl Into<String>
     }
 }
 
+/// Returns `factor` if it is finite and above 0. `place` and `expected` are for the message.
+fn checked_factor(path: &Path, place: &str, expected: &str, factor: f64) -> Result<f64, FormatError> {
+    if factor > 0.0 && factor.is_finite() {
+        return Ok(factor);
+    }
+    Err(unexpected(path, place, &format!("{expected} that is finite and above 0"), factor.to_string()))
+}
+
 /// Returns the number of mm in a unit of length as instruments write it; `None` for another unit.
 fn length_mm(unit: &str) -> Option<f64> {
     Some(match unit.trim_matches(['\0', ' ']) {

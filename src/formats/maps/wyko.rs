@@ -7,7 +7,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{Bytes, map_from_top, read_with};
+use super::{Bytes, checked_factor, map_from_top, read_with};
 
 const MAGIC: &[u8] = b"\x01\x00Directory";
 const ENTRY: usize = 24;
@@ -45,12 +45,11 @@ fn parse_wyko(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
         }))
     };
     let needed = |name: &str| number(name)?.ok_or_else(|| file.unexpected(name, "a block of this name", "none"));
-    let [pitch_mm, wavelength_nm] = [needed("Pixel_size")?, needed("Wavelength")?];
-    let (aspect, mult) = (number("Aspect")?.unwrap_or(1.0), number("Mult")?.unwrap_or(1.0));
-    if !(wavelength_nm > 0.0 && aspect > 0.0 && mult != 0.0) {
-        let found = format!("{wavelength_nm}, {aspect}, {mult}");
-        return Err(file.unexpected("Wavelength, Aspect and Mult", "numbers above 0", found));
-    }
+    let checked = |name: &str, value: f64| checked_factor(path, name, "a number", value);
+    let pitch_mm = checked("Pixel_size", needed("Pixel_size")?)?;
+    let wavelength_nm = checked("Wavelength", needed("Wavelength")?)?;
+    let aspect = checked("Aspect", number("Aspect")?.unwrap_or(1.0))?;
+    let mult = checked("Mult", number("Mult")?.unwrap_or(1.0))?;
     let is_height = |block: &&Block| block.kind == 3 && HEIGHTS.contains(&block.name.as_str());
     let mut arrays = blocks.iter().filter(is_height);
     let (Some(array), None) = (arrays.next(), arrays.next()) else {

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{map_from_top, read_with, unexpected};
+use super::{checked_factor, map_from_top, read_with, unexpected};
 
 /// Names of the arrays that have heights.
 const HEIGHTS: [&str; 5] = ["RAW_DATA", "RAW DATA", "OPD", "Raw", "SAMPLE_DATA"];
@@ -73,11 +73,18 @@ impl Header {
         let rows = self.size[1].ok_or_else(|| missing("Y Size"))?;
         check_size(path, columns as u64, rows as u64)?;
         let pitch_mm = self.pitch_mm.ok_or_else(|| missing("Pixel_size"))?;
+        let pitch_mm = checked_factor(path, "Pixel_size", "a number of mm", pitch_mm)?;
+        let aspect = checked_factor(path, "Aspect", "a ratio", self.aspect.unwrap_or(1.0))?;
         // Two readers disagree whether heights are divided by it or multiplied.
         if let Some(mult) = self.mult.filter(|mult| *mult != 1.0) {
             return Err(unexpected(path, "Mult", "1", mult.to_string()));
         }
-        let unit_mm = if is_nm { 1e-6 } else { 1e-6 * self.wavelength_nm.ok_or_else(|| missing("Wavelength"))? };
+        let unit_mm = if is_nm {
+            1e-6
+        } else {
+            let wavelength_nm = self.wavelength_nm.ok_or_else(|| missing("Wavelength"))?;
+            1e-6 * checked_factor(path, "Wavelength", "a number of nm", wavelength_nm)?
+        };
         let mut values: Vec<Option<f64>> = Vec::new();
         for (number, line) in lines.take(columns) {
             let wrong = |expected: &str, found: &str| unexpected(path, &format!("line {number}"), expected, found);
@@ -103,7 +110,7 @@ impl Header {
                 expected,
             });
         }
-        let spacing_mm = [pitch_mm, pitch_mm * self.aspect.unwrap_or(1.0)];
+        let spacing_mm = [pitch_mm, pitch_mm * aspect];
         map_from_top(path, [columns, rows], spacing_mm, |index| {
             let (column, row) = (index % columns, rows - 1 - index / columns);
             values[column * rows + row].map(|value| value * unit_mm)

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use regrind_core::geometry::Point;
-use regrind_formats::{FormatError, NotedPoints, Table, read_measured_with_notes};
+use regrind_formats::{FormatError, NotedPoints, Table, parse_map, read_measured_with_notes};
 
 fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/maps")
@@ -86,6 +86,80 @@ fn maps_without_scale_or_unit_are_refused() {
     }
     let refused = read(&folder().join("4d-4sight-no-wavelength.h5")).unwrap_err();
     assert!(matches!(refused, FormatError::Unexpected { .. }), "{refused}");
+}
+
+/// Returns the bytes of a fixture, in which the only occurrence of `from` is replaced by `to`.
+fn changed(name: &str, from: &[u8], to: &[u8]) -> Vec<u8> {
+    let bytes = std::fs::read(folder().join(name)).unwrap();
+    let places: Vec<usize> = (0..bytes.len()).filter(|at| bytes[*at..].starts_with(from)).collect();
+    assert_eq!(places.len(), 1, "{name}: {from:x?}");
+    [&bytes[..places[0]], to, &bytes[places[0] + from.len()..]].concat()
+}
+
+/// Returns the bytes with each `from` replaced by a `to` of the same length.
+fn replaced(bytes: &[u8], from: &[u8], to: &[u8]) -> Vec<u8> {
+    let mut bytes = bytes.to_vec();
+    for at in 0..bytes.len() {
+        if bytes[at..].starts_with(from) {
+            bytes[at..at + to.len()].copy_from_slice(to);
+        }
+    }
+    bytes
+}
+
+/// Returns the place in the file that the error names.
+#[track_caller]
+fn refused_place(name: &str, bytes: &[u8]) -> String {
+    match parse_map(Path::new(name), bytes) {
+        Err(FormatError::Unexpected { place, .. }) => place,
+        other => panic!("{name}: {other:?}"),
+    }
+}
+
+/// Factors of heights and distances that are zero, negative, infinite or NaN.
+#[test]
+fn maps_with_impossible_factors_are_refused() {
+    const WRONG: [f64; 4] = [0.0, -0.5, f64::INFINITY, f64::NAN];
+    for wrong in WRONG {
+        let single = (wrong as f32).to_le_bytes();
+        for (at, place) in [(120, "step of x (byte 120)"), (124, "step of y (byte 124)"), (128, "step of z (byte 128)")]
+        {
+            let mut bytes = std::fs::read(folder().join("surfalize-uncompressed.sur")).unwrap();
+            bytes[at..at + 4].copy_from_slice(&single);
+            assert_eq!(refused_place("a.sur", &bytes), place, "{wrong}");
+        }
+        let bytes = changed(
+            "opdx-2d-matrix.opdx",
+            b"\0\0\0\0\0\0\xf0\x3f\x09\0\0\0",
+            &[&wrong.to_le_bytes()[..], b"\x09\0\0\0"].concat(),
+        );
+        assert_eq!(refused_place("a.opdx", &bytes), "/2D_Data/Raw/DataScale", "{wrong}");
+        for (at, place) in [(0xda, "Wavelength"), (0xe0, "Aspect"), (0xe4, "Pixel_size")] {
+            let mut bytes = std::fs::read(folder().join("opd-float32.opd")).unwrap();
+            bytes[at..at + 4].copy_from_slice(&single);
+            assert_eq!(refused_place("a.opd", &bytes), place, "{wrong}");
+        }
+        for (line, place) in [
+            ("Wavelength\t7\t4\t632.800", "Wavelength"),
+            ("Aspect\t7\t4\t0.5", "Aspect"),
+            ("Pixel_size\t7\t4\t0.5", "Pixel_size"),
+        ] {
+            let bytes = changed("wyko-waves.asc", line.as_bytes(), format!("{place}\t7\t4\t{wrong}").as_bytes());
+            assert_eq!(refused_place("a.asc", &bytes), place, "{wrong}");
+        }
+    }
+    let name = "datx-earliest-contiguous-fringes.datx";
+    for wrong in WRONG {
+        let bytes =
+            replaced(&std::fs::read(folder().join(name)).unwrap(), &6.328e-7f64.to_le_bytes(), &wrong.to_le_bytes());
+        let place = refused_place(name, &bytes);
+        assert!(place.starts_with("/Data/Surface/") && place.ends_with(", Wavelength"), "{wrong}: {place}");
+    }
+    for wrong in [0i16, -2] {
+        let mut bytes = std::fs::read(folder().join("opd-float32.opd")).unwrap();
+        bytes[0xde..0xe0].copy_from_slice(&wrong.to_le_bytes());
+        assert_eq!(refused_place("a.opd", &bytes), "Mult", "{wrong}");
+    }
 }
 
 /// Scanner points of the same surface, in metres.
