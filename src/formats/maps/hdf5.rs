@@ -62,10 +62,15 @@ fn zygo_mx(path: &Path, file: &Hdf5File) -> Result<HeightMap, FormatError> {
         return Err(unexpected(path, &place, &format!("the unit of Unit and of Z Converter alike ({unit})"), other));
     }
     let wavelength_mm = || attributes.factor("Wavelength").map(|wavelength_m| 1e3 * wavelength_m);
+    let mut note = None;
     let unit_mm = match unit {
         "Fringes" => {
-            let obliquity =
-                if attributes.has("Obliquity Factor") { attributes.factor("Obliquity Factor")? } else { 1.0 };
+            let obliquity = if attributes.has("Obliquity Factor") {
+                attributes.factor("Obliquity Factor")?
+            } else {
+                note = Some("the file states no obliquity factor; the heights were read with the factor 1".to_owned());
+                1.0
+            };
             wavelength_mm()? * attributes.factor("Interferometric Scale Factor")? * obliquity
         }
         "Waves" => wavelength_mm()?,
@@ -76,7 +81,9 @@ fn zygo_mx(path: &Path, file: &Hdf5File) -> Result<HeightMap, FormatError> {
     let mark = mark.min(MARK);
     // The mark is stored with the digits of the heights: 2147483640 is 2147483648 in 32 bits.
     let is_height = |value: f64| value.is_finite() && value < mark && value.abs() < MARK;
-    map_of(path, &place, &surface, spacing_mm, |value| is_height(value).then_some(value * unit_mm))
+    let mut map = map_of(path, &place, &surface, spacing_mm, |value| is_height(value).then_some(value * unit_mm))?;
+    map.notes.extend(note);
+    Ok(map)
 }
 
 /// Returns the path of the surface: the one to which the table of metadata leads, or the only one.
@@ -182,7 +189,13 @@ impl Attributes<'_> {
         let converter = self.get(name)?;
         let parameters = converter.as_ref().and_then(|converter| converter.member("Parameters"));
         match parameters {
-            Some(Value::List(list)) => Ok(1e3 * list.get(1).and_then(Value::number).unwrap_or(0.0)),
+            Some(Value::List(list)) => match list.get(1).and_then(Value::number) {
+                Some(pitch_m) => Ok(1e3 * pitch_m),
+                None => {
+                    let place = format!("{}, {name}", self.name);
+                    Err(unexpected(self.path, &place, "a number as the second parameter", format!("{list:?}")))
+                }
+            },
             _ => Err(unexpected(self.path, &self.name, &format!("an attribute {name} with parameters"), "none")),
         }
     }

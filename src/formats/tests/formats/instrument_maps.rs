@@ -162,6 +162,28 @@ fn maps_with_impossible_factors_are_refused() {
     }
 }
 
+#[test]
+fn missing_obliquity_is_noted() {
+    let name = "datx-earliest-contiguous-fringes.datx";
+    let bytes = std::fs::read(folder().join(name)).unwrap();
+    let home = tempfile::tempdir().unwrap();
+    let path = home.path().join(name);
+    std::fs::write(&path, replaced(&bytes, b"Obliquity Factor", b"Obliquity Farbe ")).unwrap();
+    let (noted, stated) = (read(&path).unwrap(), read(&folder().join(name)).unwrap());
+    assert_eq!((noted.notes.len(), stated.notes.len()), (1, 0));
+}
+
+/// A converter of Zygo Mx with one parameter has no distance of the samples.
+#[test]
+fn short_converter_is_refused() {
+    let name = "datx-earliest-contiguous-fringes.datx";
+    let bytes = std::fs::read(folder().join(name)).unwrap();
+    let heap = bytes.windows(4).position(|part| part == b"GCOL").expect("the heap of the texts and lists") as u64;
+    let list = |count: u32| [&count.to_le_bytes()[..], &heap.to_le_bytes()].concat();
+    let place = refused_place(name, &replaced(&bytes, &list(4), &list(1)));
+    assert!(place.ends_with(", X Converter"), "{place}");
+}
+
 /// Scanner points of the same surface, in metres.
 #[test]
 fn scanner_points_match_surface() {
