@@ -10,6 +10,10 @@ use super::{checked_factor, map_from_top, read_with, unexpected};
 /// Names of the arrays that have heights.
 const HEIGHTS: [&str; 5] = ["RAW_DATA", "RAW DATA", "OPD", "Raw", "SAMPLE_DATA"];
 
+/// Cells of a line, counted from 0, that have the value of a block and the size of the map.
+const VALUE_CELL: usize = 3;
+const SIZE_CELL: usize = 1;
+
 /// ASCII format of Wyko Vision, detected by its first bytes.
 pub(in super::super) const FORMAT: MapFormat = MapFormat {
     begins: |head| head.starts_with(b"Wyko ASCII Data File"),
@@ -43,13 +47,17 @@ fn parse_wyko_ascii(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError>
     let mut header = Header::default();
     for (number, line) in lines.by_ref() {
         let cells: Vec<&str> = line.split('\t').map(str::trim).collect();
+        let cell = |at: usize| cells.get(at).copied().unwrap_or_default();
+        // A block has its type and its length before the value.
         let value = || -> Result<f64, FormatError> {
-            let value = cells.iter().rev().find(|cell| !cell.is_empty()).copied().unwrap_or_default();
-            value.parse().map_err(|_| wrong(number, "a number as the value", value))
+            cell(VALUE_CELL).parse().map_err(|_| wrong(number, "name, type, length and a number", line))
+        };
+        let size = || -> Result<usize, FormatError> {
+            cell(SIZE_CELL).parse().map_err(|_| wrong(number, "a whole number of samples", line))
         };
         match cells[0] {
-            "X Size" => header.size[0] = Some(value()? as usize),
-            "Y Size" => header.size[1] = Some(value()? as usize),
+            "X Size" => header.size[0] = Some(size()?),
+            "Y Size" => header.size[1] = Some(size()?),
             "Pixel_size" => header.pitch_mm = Some(value()?),
             "Wavelength" => header.wavelength_nm = Some(value()?),
             "Aspect" => header.aspect = Some(value()?),

@@ -173,6 +173,23 @@ fn missing_obliquity_is_noted() {
     assert_eq!((noted.notes.len(), stated.notes.len()), (1, 0));
 }
 
+/// The value of a block is in the fourth cell: the length before it, and remarks after it, are no values.
+#[test]
+fn value_of_wyko_ascii_is_in_its_cell() {
+    let (name, block) = ("wyko-waves.asc", "Pixel_size\t7\t4\t0.5");
+    for line in ["Pixel_size\t7\t4\t", "Pixel_size\t7\t4", "Pixel_size\t7\t4\t\t0.5", "Pixel_size\t0.5"] {
+        let bytes = changed(name, block.as_bytes(), line.as_bytes());
+        assert_eq!(refused_place(name, &bytes), "line 7", "{line:?}");
+    }
+    let remark = changed(name, block.as_bytes(), b"Pixel_size\t7\t4\t0.5\t7");
+    let plain = std::fs::read(folder().join(name)).unwrap();
+    assert_eq!(parse_map(Path::new(name), &remark).unwrap(), parse_map(Path::new(name), &plain).unwrap());
+    for size in ["-5", "5.5", "NaN", ""] {
+        let bytes = changed(name, b"Y Size\t5", format!("Y Size\t{size}").as_bytes());
+        assert_eq!(refused_place(name, &bytes), "line 3", "{size:?}");
+    }
+}
+
 /// A converter of Zygo Mx with one parameter has no distance of the samples.
 #[test]
 fn short_converter_is_refused() {
