@@ -190,6 +190,32 @@ fn value_of_wyko_ascii_is_in_its_cell() {
     }
 }
 
+/// A file of Alicona without an image of depths has the offset 0. A damaged number of tags can be any.
+#[test]
+fn alicona_without_depths_is_refused() {
+    let name = "surfalize.al3d";
+    let tag = |key: &str, value: &str| {
+        let mut tag = vec![0; 50];
+        tag[..key.len()].copy_from_slice(key.as_bytes());
+        tag[20..20 + value.len()].copy_from_slice(value.as_bytes());
+        tag
+    };
+    let cases = [
+        ("DepthImageOffset", "845", "0"),
+        ("DepthImageOffset", "845", "-845"),
+        ("DepthImageOffset", "845", "588"),
+        ("TagCount", "9", "18446744073709551615"),
+        ("TagCount", "9", "1001"),
+        ("TagCount", "9", "nine"),
+        ("Cols", "7", "6.5"),
+        ("Rows", "5", "-5"),
+    ];
+    for (key, stated, wrong) in cases {
+        let bytes = changed(name, &tag(key, stated), &tag(key, wrong));
+        assert_eq!(refused_place(name, &bytes), format!("tag {key}"), "{wrong}");
+    }
+}
+
 /// A converter of Zygo Mx with one parameter has no distance of the samples.
 #[test]
 fn short_converter_is_refused() {
