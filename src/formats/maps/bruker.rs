@@ -1,6 +1,7 @@
 //! Maps of Bruker (`.opdx`): a tree of named items. The heights are in `/2D_Data/NAME/Matrix`, f32, the top row first,
 //! with the extents and the scale beside it.
 
+use std::ops::Range;
 use std::path::Path;
 
 use super::super::error::FormatError;
@@ -25,11 +26,13 @@ enum Value {
         value: f64,
         symbol: String,
     },
-    /// Matrix of f32: columns, rows, and the first byte.
+    /// Matrix of f32: columns, rows, and its bytes in the file.
     Matrix {
         size: [usize; 2],
-        begin: usize,
+        bytes: Range<usize>,
     },
+    /// Whole number of 32 bits.
+    Whole(i64),
 }
 
 struct Reader<'a> {
@@ -53,12 +56,24 @@ fn parse_bruker(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     }
     let primary = text("/MetaData/PrimaryData2D").unwrap_or("Raw");
     let name = |key: &str| format!("/2D_Data/{primary}/{key}");
-    let Some(Value::Matrix { size: [columns, rows], begin }) = item(&name("Matrix")) else {
+    let Some(Value::Matrix { size: [columns, rows], bytes: matrix }) = item(&name("Matrix")) else {
         return Err(file.unexpected(&name("Matrix"), "a matrix of heights", "none"));
     };
-    let (columns, rows, begin) = (*columns, *rows, *begin);
+    let (columns, rows, begin) = (*columns, *rows, matrix.start);
     check_size(path, columns as u64, rows as u64)?;
-    file.slice(begin, 4 * columns * rows)?;
+    if matrix.len() != 4 * columns * rows {
+        let expected = format!("{} bytes, as {columns} columns and {rows} rows have", 4 * columns * rows);
+        return Err(file.unexpected(&name("Matrix"), &expected, format!("{} bytes", matrix.len())));
+    }
+    for (key, count) in [("Dimension1Points", rows), ("Dimension2Points", columns)] {
+        match item(&name(key)) {
+            Some(Value::Whole(stated)) if *stated != count as i64 => {
+                let expected = format!("{count} points, as the matrix has");
+                return Err(file.unexpected(&name(key), &expected, stated.to_string()));
+            }
+            _ => {}
+        }
+    }
     let quantity_mm = |key: &str| match item(&name(key)) {
         Some(Value::Quantity { value, symbol }) => {
             let unit = length_mm(symbol).ok_or_else(|| file.unexpected(&name(key), "a unit of length", symbol))?;
@@ -111,7 +126,12 @@ impl Reader<'_> {
         match kind {
             0x01 => self.skip(1),
             0x04 | 0x05 => self.skip(2),
-            0x06 | 0x07 | 0x0c => self.skip(4),
+            0x06 | 0x07 => {
+                let whole = if kind == 0x06 { self.file.i32(self.at)?.into() } else { self.file.u32(self.at)?.into() };
+                self.items.push((name.to_owned(), Value::Whole(whole)));
+                self.skip(4)
+            }
+            0x0c => self.skip(4),
             0x0a | 0x0b | 0x0d => self.skip(8),
             0x12 => {
                 let length = self.length()?;
@@ -143,7 +163,8 @@ impl Reader<'_> {
                 }
                 let end = self.end()?;
                 let [rows, columns] = [self.file.u32(self.at)? as usize, self.file.u32(self.at + 4)? as usize];
-                self.items.push((name.to_owned(), Value::Matrix { size: [columns, rows], begin: self.at + 8 }));
+                let bytes = (self.at + 8).min(end)..end;
+                self.items.push((name.to_owned(), Value::Matrix { size: [columns, rows], bytes }));
                 self.at = end;
                 Ok(())
             }

@@ -216,6 +216,21 @@ fn alicona_without_depths_is_refused() {
     }
 }
 
+/// Columns and rows of a matrix must make up its bytes, and be those that stand beside it.
+#[test]
+fn matrix_of_other_size_is_refused() {
+    let name = "opdx-2d-matrix.opdx";
+    let sizes = |rows: u32, columns: u32| [b"\x94", &rows.to_le_bytes()[..], &columns.to_le_bytes()].concat();
+    for (rows, columns) in [(5, 6), (4, 7), (1, 7)] {
+        let bytes = changed(name, &sizes(5, 7), &sizes(rows, columns));
+        assert_eq!(refused_place(name, &bytes), "/2D_Data/Raw/Matrix", "{rows} x {columns}");
+    }
+    let turned = changed(name, &sizes(5, 7), &sizes(7, 5));
+    assert_eq!(refused_place(name, &turned), "/2D_Data/Raw/Dimension1Points");
+    let points = changed(name, b"Dimension2Points\x07\x07", b"Dimension2Points\x07\x09");
+    assert_eq!(refused_place(name, &points), "/2D_Data/Raw/Dimension2Points");
+}
+
 /// A converter of Zygo Mx with one parameter has no distance of the samples.
 #[test]
 fn short_converter_is_refused() {
