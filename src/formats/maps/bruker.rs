@@ -11,6 +11,23 @@ use super::{Bytes, checked_factor, length_mm, map_from_top, read_with};
 const MAGIC: &[u8] = b"VCA DATA\x01\x00\x00\x55";
 const MAX_DEPTH: usize = 32;
 const MAX_ITEMS: usize = 1_000_000;
+/// Largest number of items that are kept. A map has eight.
+const MAX_USED_ITEMS: usize = 10_000;
+/// Longest name of an item or a type, in bytes. The path of an item repeats the names of the containers around it.
+const MAX_NAME: usize = 256;
+/// Depth of the containers in which items are used.
+const USED_DEPTH: usize = 2;
+/// Names of the items that are used. Other items are not kept, so that a file of many items needs little memory.
+const USED: [&str; 8] = [
+    "DataKind",
+    "PrimaryData2D",
+    "Matrix",
+    "Dimension1Points",
+    "Dimension2Points",
+    "Dimension1Extent",
+    "Dimension2Extent",
+    "DataScale",
+];
 
 /// Format of Bruker, detected by its first bytes.
 pub(in super::super) const FORMAT: MapFormat = MapFormat {
@@ -40,11 +57,13 @@ struct Reader<'a> {
     at: usize,
     items: Vec<(String, Value)>,
     count: usize,
+    /// Whether the item that is read is used.
+    is_used: bool,
 }
 
 fn parse_bruker(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     let file = Bytes { path, bytes };
-    let mut reader = Reader { file, at: MAGIC.len(), items: Vec::new(), count: 0 };
+    let mut reader = Reader { file, at: MAGIC.len(), items: Vec::new(), count: 0, is_used: false };
     reader.read_items("", bytes.len(), 0)?;
     let item = |name: &str| reader.items.iter().find(|(path, _)| path == name).map(|(_, value)| value);
     let text = |name: &str| match item(name) {
@@ -110,7 +129,9 @@ impl Reader<'_> {
             if self.count > MAX_ITEMS {
                 return Err(self.file.unexpected(parent, "at most 1000000 items", "more"));
             }
-            let name = format!("{parent}/{}", self.name()?);
+            let name = self.name()?;
+            self.is_used = depth <= USED_DEPTH && USED.contains(&name.as_str());
+            let name = format!("{parent}/{name}");
             let kind = self.byte()?;
             // The end of a container.
             if kind == 0x7f {
@@ -128,7 +149,7 @@ impl Reader<'_> {
             0x04 | 0x05 => self.skip(2),
             0x06 | 0x07 => {
                 let whole = if kind == 0x06 { self.file.i32(self.at)?.into() } else { self.file.u32(self.at)?.into() };
-                self.items.push((name.to_owned(), Value::Whole(whole)));
+                self.keep(name, Value::Whole(whole))?;
                 self.skip(4)
             }
             0x0c => self.skip(4),
@@ -136,7 +157,7 @@ impl Reader<'_> {
             0x12 => {
                 let length = self.length()?;
                 let text = self.file.slice(self.at, length)?;
-                self.items.push((name.to_owned(), Value::Text(String::from_utf8_lossy(text).into_owned())));
+                self.keep(name, Value::Text(String::from_utf8_lossy(text).into_owned()))?;
                 self.skip(length)
             }
             0x13 => {
@@ -145,7 +166,7 @@ impl Reader<'_> {
                 self.at += 8;
                 self.name()?;
                 let symbol = self.name()?;
-                self.items.push((name.to_owned(), Value::Quantity { value, symbol }));
+                self.keep(name, Value::Quantity { value, symbol })?;
                 self.at = end;
                 Ok(())
             }
@@ -164,7 +185,7 @@ impl Reader<'_> {
                 let end = self.end()?;
                 let [rows, columns] = [self.file.u32(self.at)? as usize, self.file.u32(self.at + 4)? as usize];
                 let bytes = (self.at + 8).min(end)..end;
-                self.items.push((name.to_owned(), Value::Matrix { size: [columns, rows], bytes }));
+                self.keep(name, Value::Matrix { size: [columns, rows], bytes })?;
                 self.at = end;
                 Ok(())
             }
@@ -188,8 +209,24 @@ impl Reader<'_> {
         Ok(())
     }
 
+    /// Keeps the value of an item that is used.
+    fn keep(&mut self, name: &str, value: Value) -> Result<(), FormatError> {
+        if !self.is_used {
+            return Ok(());
+        }
+        if self.items.len() == MAX_USED_ITEMS {
+            return Err(self.file.unexpected(name, "at most 10000 items of maps", "more"));
+        }
+        self.items.push((name.to_owned(), value));
+        Ok(())
+    }
+
     fn name(&mut self) -> Result<String, FormatError> {
         let length = self.file.u32(self.at)? as usize;
+        if length > MAX_NAME {
+            let place = format!("byte {}", self.at);
+            return Err(self.file.unexpected(&place, "a name of at most 256 bytes", length.to_string()));
+        }
         let name = self.file.slice(self.at.saturating_add(4), length)?;
         self.at += 4 + length;
         Ok(String::from_utf8_lossy(name).into_owned())

@@ -231,6 +231,21 @@ fn matrix_of_other_size_is_refused() {
     assert_eq!(refused_place(name, &points), "/2D_Data/Raw/Dimension2Points");
 }
 
+/// The path of an item repeats the names around it: long names and many items would need much more memory than the file.
+#[test]
+fn long_names_and_many_items_are_refused() {
+    let named = |name: &str| [&(name.len() as u32).to_le_bytes()[..], name.as_bytes()].concat();
+    let container = |name: &str, content: &[u8]| {
+        [&named(name), &b"\x7d\x04"[..], &(content.len() as u32).to_le_bytes(), content].concat()
+    };
+    let file = |content: &[u8]| [b"VCA DATA\x01\x00\x00\x55", &container("2D_Data", content)[..]].concat();
+    let item = [&named("DataKind")[..], b"\x12\x01\x00"].concat();
+    let many = file(&container("Raw", &item.repeat(20_000)));
+    assert_eq!(refused_place("a.opdx", &many), "/2D_Data/Raw/DataKind");
+    let long = file(&container(&"x".repeat(257), &item));
+    assert_eq!(refused_place("a.opdx", &long), format!("byte {}", b"VCA DATA1234".len() + named("2D_Data").len() + 6));
+}
+
 /// A converter of Zygo Mx with one parameter has no distance of the samples.
 #[test]
 fn short_converter_is_refused() {
