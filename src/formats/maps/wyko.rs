@@ -13,6 +13,9 @@ const MAGIC: &[u8] = b"\x01\x00Directory";
 const ENTRY: usize = 24;
 const MAX_BLOCKS: usize = 100_000;
 
+/// Name of a block whose length some versions of the program state wrongly, and that length.
+const MISSTATED: (&str, usize) = ("ImageModificat~0", 40);
+
 /// Names of the arrays that have heights; others have intensities.
 const HEIGHTS: [&str; 5] = ["RAW_DATA", "RAW DATA", "OPD", "Raw", "SAMPLE_DATA"];
 
@@ -91,17 +94,37 @@ fn blocks(file: &Bytes<'_>) -> Result<Vec<Block>, FormatError> {
     if count == 0 || count > MAX_BLOCKS {
         return Err(file.unexpected("directory", "1 to 100000 blocks", count.to_string()));
     }
-    let mut begin = 2 + directory.length;
-    let mut blocks = Vec::new();
+    let mut blocks: Vec<Block> = Vec::new();
     for k in 1..count {
-        let mut block = entry(k)?;
-        if block.name.is_empty() || block.length == 0 {
-            continue;
+        let block = entry(k)?;
+        if !block.name.is_empty() && block.length > 0 {
+            blocks.push(block);
         }
+    }
+    let contents = 2 + directory.length;
+    let end = |blocks: &[Block]| blocks.iter().fold(contents, |end, block| end.saturating_add(block.length));
+    if end(&blocks) != file.bytes.len() {
+        // Some versions state 40 bytes for this number of four bytes.
+        for block in blocks.iter_mut().filter(|block| (block.name.as_str(), block.length) == MISSTATED) {
+            block.length = 4;
+        }
+    }
+    let end = end(&blocks);
+    if end > file.bytes.len() {
+        return Err(FormatError::Cut {
+            path: file.path.to_owned(),
+            place: format!("byte {}", file.bytes.len()),
+            expected: format!("{end} bytes, as the directory says"),
+        });
+    }
+    if end < file.bytes.len() {
+        let expected = format!("blocks up to the end of the file at byte {}", file.bytes.len());
+        return Err(file.unexpected("directory", &expected, format!("blocks up to byte {end}")));
+    }
+    let mut begin = contents;
+    for block in &mut blocks {
         block.begin = begin;
-        file.slice(begin, block.length)?;
         begin += block.length;
-        blocks.push(block);
     }
     Ok(blocks)
 }

@@ -246,6 +246,29 @@ fn long_names_and_many_items_are_refused() {
     assert_eq!(refused_place("a.opdx", &long), format!("byte {}", b"VCA DATA1234".len() + named("2D_Data").len() + 6));
 }
 
+/// The lengths of all blocks add up to the file. A wrong one shifts the blocks behind it.
+#[test]
+fn blocks_of_wyko_make_up_file() {
+    let name = "opd-float32.opd";
+    let plain = std::fs::read(folder().join(name)).unwrap();
+    assert_eq!(refused_place(name, &[&plain[..], b"\0\0\0\0"].concat()), "directory");
+    let cut = parse_map(Path::new(name), &plain[..plain.len() - 1]);
+    assert!(matches!(cut, Err(FormatError::Cut { .. })), "{cut:?}");
+    let title = |name: &str, kind: u8, length: u8| {
+        let mut entry = name.as_bytes().to_vec();
+        entry.resize(16, 0);
+        [&entry[..], &[kind, 0, length, 0, 0, 0]].concat()
+    };
+    let longer = changed(name, &title("Title", 5, 9), &title("Title", 5, 5));
+    assert_eq!(refused_place(name, &longer), "directory");
+
+    // Some versions state 40 bytes for a block of four.
+    let mut misstated = changed(name, &title("Title", 5, 9), &title("ImageModificat~0", 7, 40));
+    let content = misstated.windows(7).position(|part| part == b"fixture").expect("the title");
+    misstated.drain(content + 4..content + 9);
+    assert_eq!(parse_map(Path::new(name), &misstated).unwrap(), parse_map(Path::new(name), &plain).unwrap());
+}
+
 /// A converter of Zygo Mx with one parameter has no distance of the samples.
 #[test]
 fn short_converter_is_refused() {
