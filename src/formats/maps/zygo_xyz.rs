@@ -7,6 +7,9 @@ use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
 use super::{map_from_top, read_with, unexpected};
 
+/// Bytes of the shortest line of a sample: three numbers of one digit, with what separates them.
+const SHORTEST_LINE: usize = "0 0 0\n".len();
+
 /// XYZ format of Zygo, detected by its first bytes.
 pub(in super::super) const FORMAT: MapFormat = MapFormat {
     begins: |head| head.starts_with(b"Zygo XYZ Data File"),
@@ -16,12 +19,12 @@ pub(in super::super) const FORMAT: MapFormat = MapFormat {
 
 fn parse_zygo_xyz(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     let text = String::from_utf8_lossy(bytes);
-    let lines: Vec<&str> = text.lines().map(str::trim).collect();
+    let lines = || text.lines().map(str::trim);
     let wrong = |line: usize, expected: &str| {
-        unexpected(path, &format!("line {line}"), expected, lines.get(line - 1).copied().unwrap_or("the end"))
+        unexpected(path, &format!("line {line}"), expected, lines().nth(line - 1).unwrap_or("the end"))
     };
     let numbers = |line: usize, count: usize| -> Result<Vec<f64>, FormatError> {
-        let words = lines.get(line - 1).map(|line| line.split_whitespace().take(count)).into_iter().flatten();
+        let words = lines().nth(line - 1).map(|line| line.split_whitespace().take(count)).into_iter().flatten();
         let numbers: Option<Vec<f64>> = words.map(|word| word.parse().ok()).collect();
         let numbers = numbers.filter(|numbers| numbers.len() == count && numbers.iter().all(|n| n.is_finite()));
         numbers.ok_or_else(|| wrong(line, &format!("{count} numbers")))
@@ -35,13 +38,18 @@ fn parse_zygo_xyz(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     }
     let [columns, rows] = size.map(|n| n as usize);
     check_size(path, columns as u64, rows as u64)?;
+    if columns * rows > bytes.len() / SHORTEST_LINE {
+        let place = format!("byte {}", bytes.len());
+        let expected = format!("a line for each of {columns} times {rows} samples");
+        return Err(FormatError::Cut { path: path.to_owned(), place, expected });
+    }
     // Source, scale factor, wavelength, aperture, obliquity, magnification, resolution of the camera in metres.
     let pitch_mm = 1e3 * numbers(8, 7)?[6];
-    let begin = lines.iter().position(|line| *line == "#").ok_or_else(|| wrong(lines.len().max(1), "a line #"))?;
+    let begin = lines().position(|line| line == "#").ok_or_else(|| wrong(lines().count().max(1), "a line #"))?;
     let mut heights: Vec<Option<f64>> = vec![None; columns * rows];
     let mut seen = vec![false; columns * rows];
-    for (i, line) in lines.iter().enumerate().skip(begin + 1) {
-        if *line == "#" {
+    for (i, line) in lines().enumerate().skip(begin + 1) {
+        if line == "#" {
             break;
         }
         let words: Vec<&str> = line.split_whitespace().collect();

@@ -269,6 +269,14 @@ fn blocks_of_wyko_make_up_file() {
     assert_eq!(parse_map(Path::new(name), &misstated).unwrap(), parse_map(Path::new(name), &plain).unwrap());
 }
 
+/// A size in the header is held against the bytes of the file before memory is reserved for it.
+#[test]
+fn size_beyond_file_is_refused() {
+    let name = "zygo-format1.xyz";
+    let refused = parse_map(Path::new(name), &changed(name, b"10 20 7 5", b"10 20 7000 7000"));
+    assert!(matches!(&refused, Err(FormatError::Cut { place, .. }) if place == "byte 700"), "{refused:?}");
+}
+
 /// A converter of Zygo Mx with one parameter has no distance of the samples.
 #[test]
 fn short_converter_is_refused() {
