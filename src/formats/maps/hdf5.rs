@@ -17,6 +17,9 @@ const MAGIC: &[u8] = b"\x89HDF\r\n\x1a\n";
 /// Largest number of bytes that one dataset unpacks to: the largest map in 64 bits.
 const MAX_DECODED: usize = 8 * MAX_SAMPLES as usize;
 
+/// Largest ratio of the bytes of a dataset to those of its file. Deflate packs 1032 bytes into one at the most.
+const MAX_RATIO: usize = 1100;
+
 /// Heights of this magnitude and more are marks, whatever the file says.
 const MARK: f64 = 1e37;
 
@@ -36,7 +39,8 @@ struct Attributes<'a> {
 }
 
 fn parse_hdf5(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
-    let options = OpenOptions::default().with_max_read_bytes(MAX_DECODED).with_max_chunk_bytes(MAX_DECODED);
+    let limit = bytes.len().saturating_mul(MAX_RATIO).min(MAX_DECODED);
+    let options = OpenOptions::default().with_max_read_bytes(limit).with_max_chunk_bytes(limit);
     let file = Hdf5File::from_vec_with_options(bytes.to_vec(), options);
     let file = file.map_err(|error| unexpected(path, "file", "HDF5", error.to_string()))?;
     if file.group("/measurement0/genraw").is_ok() || file.group("/measurement0").is_ok() {

@@ -4,8 +4,11 @@ use hdf5_reader::group::Group;
 use hdf5_reader::messages::datatype::{StringSize, VarLenKind};
 use hdf5_reader::{Attribute, ByteOrder, Dataset, Datatype};
 
-/// Largest number of values of one attribute or table that is decoded.
+/// Largest number of values of one attribute or table that is decoded, with those within lists and records.
 const MAX_VALUES: usize = 100_000;
+
+/// Largest number of bytes of all texts, lists and names of members of one attribute or table.
+const MAX_CONTENT_BYTES: usize = 16 << 20;
 
 /// Value of an attribute, or of a cell of a table.
 #[derive(Clone, Debug, PartialEq)]
@@ -55,13 +58,13 @@ pub(super) fn attribute(attribute: &Attribute, group: &Group) -> Result<Value, S
         let texts = texts.into_iter().map(|text| Value::Text(text.trim_end_matches(['\0', ' ']).to_owned()));
         return Ok(Value::List(texts.take(MAX_VALUES).collect()));
     }
-    elements(&attribute.datatype, &attribute.raw_data, group).map(Value::List)
+    Decoder::new(group).elements(&attribute.datatype, &attribute.raw_data).map(Value::List)
 }
 
 /// Decodes a table, an element a row.
 pub(super) fn table(dataset: &Dataset, group: &Group) -> Result<Vec<Value>, String> {
     let bytes = dataset.read_raw_bytes().map_err(|error| error.to_string())?;
-    elements(dataset.dtype(), &bytes, group)
+    Decoder::new(group).elements(dataset.dtype(), &bytes)
 }
 
 /// Returns all numbers of a dataset as f64.
@@ -81,19 +84,6 @@ pub(super) fn numbers(dataset: &Dataset) -> Result<Vec<f64>, String> {
     })
 }
 
-fn elements(datatype: &Datatype, bytes: &[u8], group: &Group) -> Result<Vec<Value>, String> {
-    let size = size_of(datatype, reference_size(group));
-    if size == 0 {
-        return Ok(Vec::new());
-    }
-    bytes.chunks_exact(size).take(MAX_VALUES).map(|element| decoded(datatype, element, group, 0)).collect()
-}
-
-/// Returns the bytes of a reference to a value of variable length: its length, and where it is.
-fn reference_size(group: &Group) -> usize {
-    8 + usize::from(group.offset_size())
-}
-
 /// Returns the bytes of an element in the file.
 fn size_of(datatype: &Datatype, reference: usize) -> usize {
     match datatype {
@@ -111,51 +101,96 @@ fn size_of(datatype: &Datatype, reference: usize) -> usize {
     }
 }
 
-fn decoded(datatype: &Datatype, bytes: &[u8], group: &Group, depth: usize) -> Result<Value, String> {
-    const MAX_DEPTH: usize = 16;
-    let reference = reference_size(group);
-    let size = size_of(datatype, reference);
-    // The places of members are not checked when a file is opened: a damaged one can name any.
-    let bytes = bytes.get(..size).filter(|_| depth < MAX_DEPTH).ok_or("a value beyond the end of its element")?;
-    let resolved = |size: usize| group.resolve_vlen_reference_bytes(bytes, size).map_err(|error| error.to_string());
-    Ok(match datatype {
-        Datatype::FixedPoint { signed, byte_order, .. } => Value::Number(integer(bytes, *signed, is_big(byte_order))),
-        Datatype::FloatingPoint { byte_order, .. } => {
-            let mut raw = bytes.to_vec();
-            if is_big(byte_order) {
-                raw.reverse();
+/// Decoder of one attribute or table. Different values can refer to the same bytes of the file, so that its length bounds
+/// neither their number nor their bytes.
+struct Decoder<'a> {
+    group: &'a Group,
+    /// Bytes of a reference to a value of variable length: its length, and where it is.
+    reference: usize,
+    /// Values, and bytes of contents, that may still be decoded.
+    values: usize,
+    content_bytes: usize,
+}
+
+impl<'a> Decoder<'a> {
+    fn new(group: &'a Group) -> Self {
+        let reference = 8 + usize::from(group.offset_size());
+        Self { group, reference, values: MAX_VALUES, content_bytes: MAX_CONTENT_BYTES }
+    }
+
+    fn elements(&mut self, datatype: &Datatype, bytes: &[u8]) -> Result<Vec<Value>, String> {
+        let size = size_of(datatype, self.reference);
+        if size == 0 {
+            return Ok(Vec::new());
+        }
+        bytes.chunks_exact(size).map(|element| self.decoded(datatype, element, 0)).collect()
+    }
+
+    fn count_bytes(&mut self, count: usize) -> Result<(), String> {
+        let left = self.content_bytes.checked_sub(count);
+        self.content_bytes = left.ok_or_else(|| format!("more than {MAX_CONTENT_BYTES} bytes of texts and lists"))?;
+        Ok(())
+    }
+
+    /// Returns the bytes that a reference leads to: its count of elements of `size` bytes.
+    fn resolved(&mut self, reference: &[u8], size: usize) -> Result<Vec<u8>, String> {
+        let bytes = self.group.resolve_vlen_reference_bytes(reference, size).map_err(|error| error.to_string())?;
+        self.count_bytes(bytes.len())?;
+        Ok(bytes)
+    }
+
+    fn decoded(&mut self, datatype: &Datatype, bytes: &[u8], depth: usize) -> Result<Value, String> {
+        const MAX_DEPTH: usize = 16;
+        let size = size_of(datatype, self.reference);
+        // The places of members are not checked when a file is opened: a damaged one can name any.
+        let bytes = bytes.get(..size).filter(|_| depth < MAX_DEPTH).ok_or("a value beyond the end of its element")?;
+        self.values = self.values.checked_sub(1).ok_or_else(|| format!("more than {MAX_VALUES} values"))?;
+        Ok(match datatype {
+            Datatype::FixedPoint { signed, byte_order, .. } => {
+                Value::Number(integer(bytes, *signed, is_big(byte_order)))
             }
-            match raw[..] {
-                [a, b, c, d] => Value::Number(f64::from(f32::from_le_bytes([a, b, c, d]))),
-                [a, b, c, d, e, f, g, h] => Value::Number(f64::from_le_bytes([a, b, c, d, e, f, g, h])),
-                _ => Value::Other,
+            Datatype::FloatingPoint { byte_order, .. } => {
+                let mut raw = bytes.to_vec();
+                if is_big(byte_order) {
+                    raw.reverse();
+                }
+                match raw[..] {
+                    [a, b, c, d] => Value::Number(f64::from(f32::from_le_bytes([a, b, c, d]))),
+                    [a, b, c, d, e, f, g, h] => Value::Number(f64::from_le_bytes([a, b, c, d, e, f, g, h])),
+                    _ => Value::Other,
+                }
             }
-        }
-        Datatype::String { size: StringSize::Fixed(_), .. } => Value::Text(text(bytes)),
-        Datatype::String { size: StringSize::Variable, .. } | Datatype::VarLen { kind: VarLenKind::String, .. } => {
-            Value::Text(text(&resolved(1)?))
-        }
-        Datatype::VarLen { base, .. } => {
-            let size = size_of(base, reference).max(1);
-            let bytes = resolved(size)?;
-            let values = bytes.chunks_exact(size).take(MAX_VALUES).map(|part| decoded(base, part, group, depth + 1));
-            Value::List(values.collect::<Result<_, _>>()?)
-        }
-        Datatype::Array { base, .. } => {
-            let size = size_of(base, reference).max(1);
-            let values = bytes.chunks_exact(size).take(MAX_VALUES).map(|part| decoded(base, part, group, depth + 1));
-            Value::List(values.collect::<Result<_, _>>()?)
-        }
-        Datatype::Compound { fields, .. } => {
-            let member = |field: &hdf5_reader::messages::datatype::CompoundField| {
-                let part = bytes.get(field.byte_offset as usize..).ok_or("a member beyond the end of its compound")?;
-                Ok::<_, String>((field.name.clone(), decoded(&field.datatype, part, group, depth + 1)?))
-            };
-            Value::Record(fields.iter().map(member).collect::<Result<_, _>>()?)
-        }
-        Datatype::Enum { base, .. } => decoded(base, bytes, group, depth + 1)?,
-        _ => Value::Other,
-    })
+            Datatype::String { size: StringSize::Fixed(_), .. } => {
+                self.count_bytes(bytes.len())?;
+                Value::Text(text(bytes))
+            }
+            Datatype::String { size: StringSize::Variable, .. } | Datatype::VarLen { kind: VarLenKind::String, .. } => {
+                Value::Text(text(&self.resolved(bytes, 1)?))
+            }
+            Datatype::VarLen { base, .. } => {
+                let size = size_of(base, self.reference).max(1);
+                let bytes = self.resolved(bytes, size)?;
+                let values = bytes.chunks_exact(size).map(|part| self.decoded(base, part, depth + 1));
+                Value::List(values.collect::<Result<_, _>>()?)
+            }
+            Datatype::Array { base, .. } => {
+                let size = size_of(base, self.reference).max(1);
+                let values = bytes.chunks_exact(size).map(|part| self.decoded(base, part, depth + 1));
+                Value::List(values.collect::<Result<_, _>>()?)
+            }
+            Datatype::Compound { fields, .. } => {
+                let mut member = |field: &hdf5_reader::messages::datatype::CompoundField| {
+                    let part =
+                        bytes.get(field.byte_offset as usize..).ok_or("a member beyond the end of its compound")?;
+                    self.count_bytes(field.name.len())?;
+                    Ok::<_, String>((field.name.clone(), self.decoded(&field.datatype, part, depth + 1)?))
+                };
+                Value::Record(fields.iter().map(&mut member).collect::<Result<_, _>>()?)
+            }
+            Datatype::Enum { base, .. } => self.decoded(base, bytes, depth + 1)?,
+            _ => Value::Other,
+        })
+    }
 }
 
 fn is_big(order: &ByteOrder) -> bool {
@@ -177,4 +212,32 @@ fn integer(bytes: &[u8], is_signed: bool, is_big: bool) -> f64 {
 fn text(bytes: &[u8]) -> String {
     let end = bytes.iter().position(|&b| b == 0).unwrap_or(bytes.len());
     String::from_utf8_lossy(&bytes[..end]).trim_end().to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use hdf5_reader::Hdf5File;
+    use hdf5_reader::messages::datatype::CompoundField;
+
+    use super::*;
+
+    /// Members of a record that lie over each other make more values, or names, than the element has bytes.
+    #[test]
+    fn overlapping_members_are_bounded() {
+        let bytes = include_bytes!("../tests/fixtures/maps/datx-earliest-contiguous-fringes.datx");
+        let file = Hdf5File::from_bytes(bytes).unwrap();
+        let root = file.root_group().unwrap();
+        let decode = |count: usize, values: u64, name: &str| {
+            let number = Datatype::FixedPoint { size: 1, signed: false, byte_order: ByteOrder::LittleEndian };
+            let datatype = Datatype::Array { base: Box::new(number), dims: vec![values] };
+            let member = CompoundField { name: name.to_owned(), byte_offset: 0, datatype };
+            let record = Datatype::Compound { size: 200, fields: vec![member; count] };
+            Decoder::new(&root).elements(&record, &[7; 200])
+        };
+        let Ok(rows) = decode(400, 200, "a") else { panic!("80801 values") };
+        assert_eq!(rows[0].member("a").and_then(Value::number), Some(7.0));
+        assert!(decode(600, 200, "a").is_err(), "120001 values");
+        let name = "x".repeat(1 << 20);
+        assert!(decode(15, 1, &name).is_ok() && decode(17, 1, &name).is_err());
+    }
 }
