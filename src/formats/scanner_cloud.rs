@@ -6,6 +6,7 @@
 use std::io::Cursor;
 use std::path::Path;
 
+use e57::RecordDataType;
 use regrind_core::geometry::Point;
 
 use super::error::{FormatError, excerpt};
@@ -88,6 +89,35 @@ fn scale_of_pose(pose: Option<&e57::Transform>) -> Result<(f64, Point), String> 
     Ok((scale, Point::new(pose.translation.x, pose.translation.y, pose.translation.z)))
 }
 
+/// Checks the records of a scan: their types, and that the file has enough bytes for them. A value that can be one number
+/// only has no bits; if no value has bits, the library makes values without end.
+fn check_prototype(scan: &e57::PointCloud, file_bytes: usize) -> Result<(), String> {
+    let mut bits = 0u64;
+    for record in &scan.prototype {
+        let name = &record.name;
+        bits += match record.data_type {
+            RecordDataType::Single { .. } => 32,
+            RecordDataType::Double { .. } => 64,
+            RecordDataType::ScaledInteger { min, max, .. } | RecordDataType::Integer { min, max } if min > max => {
+                return Err(format!("values {name:?} from {min} to {max}"));
+            }
+            RecordDataType::ScaledInteger { scale, .. } if scale == 0.0 || !scale.is_finite() => {
+                return Err(format!("values {name:?} with the scale {scale}"));
+            }
+            RecordDataType::ScaledInteger { min, max, .. } | RecordDataType::Integer { min, max } => {
+                (i128::from(max) - i128::from(min)).checked_ilog2().map_or(0, |log| u64::from(log) + 1)
+            }
+        };
+    }
+    if bits == 0 {
+        return Err("points whose values have no bits".to_owned());
+    }
+    if scan.records.saturating_mul(bits) / 8 > file_bytes as u64 {
+        return Err(format!("{} points of {bits} bits in {file_bytes} bytes", scan.records));
+    }
+    Ok(())
+}
+
 /// Returns the valid points of all scans, in millimetres.
 fn e57_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
     let words = |error: e57::Error| error.to_string();
@@ -97,6 +127,7 @@ fn e57_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
         if scan.records.saturating_add(points.len() as u64) > MAX_POINTS {
             return Err(format!("more than {MAX_POINTS} points"));
         }
+        check_prototype(&scan, bytes.len())?;
         let (scale, origin) = scale_of_pose(scan.transform.as_ref())?;
         for point in file.pointcloud_simple(&scan).map_err(words)? {
             if let e57::CartesianCoordinate::Valid { x, y, z } = point.map_err(words)?.cartesian {
@@ -144,6 +175,36 @@ pub fn parse_scanner_cloud(path: &Path, bytes: &[u8]) -> Result<Vec<Point>, Form
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Returns a file of ten points at 5 m, whose x is said to be an integer from 5 to `most`. y and z can be 0 only.
+    fn e57_of_integers(most: i64) -> Vec<u8> {
+        let mut bytes = Cursor::new(Vec::new());
+        let mut file = e57::E57Writer::new(&mut bytes, "file").unwrap();
+        let kind = |min, max| RecordDataType::ScaledInteger { min, max, scale: 0.001, offset: 0.0 };
+        let record = |name, data_type| e57::Record { name, data_type };
+        let prototype = vec![
+            record(e57::RecordName::CartesianX, kind(5, 6)),
+            record(e57::RecordName::CartesianY, kind(0, 0)),
+            record(e57::RecordName::CartesianZ, kind(0, 0)),
+        ];
+        let mut scan = file.add_pointcloud("scan", prototype).unwrap();
+        for _ in 0..10 {
+            scan.add_point([5, 0, 0].map(e57::RecordValue::ScaledInteger).to_vec()).unwrap();
+        }
+        scan.finalize().unwrap();
+        let stated = format!("maximum=\"{most}\"");
+        file.finalize_customized_xml(|xml| Ok(xml.replace("maximum=\"6\"", &stated))).unwrap();
+        drop(file);
+        bytes.into_inner()
+    }
+
+    #[test]
+    fn e57_without_bits_is_refused() {
+        assert_eq!(e57_points(&e57_of_integers(6)).unwrap(), [Point::new(5.0, 0.0, 0.0); 10]);
+        for most in [5, 4] {
+            assert!(e57_points(&e57_of_integers(most)).is_err(), "5 to {most}");
+        }
+    }
 
     /// A part that is rounded by 2e-8 makes a scale of 1 + 2 * 0.6 * 2e-8. A length of 1.2 is no rounding.
     #[test]
