@@ -138,15 +138,40 @@ fn e57_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
     Ok(points)
 }
 
+/// Checks that the points and the extended records that a LAS file states lie within it. The library reserves memory for
+/// them before it reads them.
+fn check_las_lengths(bytes: &[u8]) -> Result<(), String> {
+    /// Bytes of an extended record before its content, and the place of its length in them.
+    const RECORD: u64 = 60;
+    const LENGTH: usize = 20;
+    /// Bit of the number of the point format.
+    const COMPRESSED: u8 = 0x80;
+    let header = las::raw::Header::read_from(bytes).map_err(|error| error.to_string())?;
+    if header.point_data_record_format & COMPRESSED != 0 {
+        return Err("compressed points (LAZ); unpack them".to_owned());
+    }
+    let file_bytes = bytes.len() as u64;
+    let large = header.large_file.map_or(0, |large| large.number_of_point_records);
+    let count = if header.number_of_point_records > 0 { header.number_of_point_records.into() } else { large };
+    let points = count.saturating_mul(header.point_data_record_length.into());
+    if count > MAX_POINTS || points.saturating_add(header.offset_to_point_data.into()) > file_bytes {
+        return Err(format!("{count} points in {file_bytes} bytes"));
+    }
+    let Some(extended) = header.evlr else { return Ok(()) };
+    let start = extended.start_of_first_evlr;
+    let length = usize::try_from(start).ok().and_then(|start| bytes.get(start.checked_add(LENGTH)?..)?.first_chunk());
+    let length = length.map_or(u64::MAX, |length| u64::from_le_bytes(*length));
+    if start.saturating_add(RECORD).saturating_add(length) > file_bytes {
+        return Err(format!("an extended record from byte {start} on, beyond the end of {file_bytes} bytes"));
+    }
+    Ok(())
+}
+
 /// Returns the points that are neither withheld nor noise, in the unit of the file.
 fn las_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
     let words = |error: las::Error| error.to_string();
+    check_las_lengths(bytes)?;
     let mut file = las::Reader::new(Cursor::new(bytes.to_vec())).map_err(words)?;
-    let count = file.header().number_of_points();
-    let record = u64::from(file.header().point_format().len());
-    if count > MAX_POINTS || count.saturating_mul(record) > bytes.len() as u64 {
-        return Err(format!("{count} points in {} bytes", bytes.len()));
-    }
     let all = file.read_all().map_err(words)?;
     let mut points = Vec::new();
     for point in all.points() {
@@ -196,6 +221,32 @@ mod tests {
         file.finalize_customized_xml(|xml| Ok(xml.replace("maximum=\"6\"", &stated))).unwrap();
         drop(file);
         bytes.into_inner()
+    }
+
+    /// LAS 1.4: the place of the first extended record is in bytes 235 to 242, their number behind it.
+    #[test]
+    fn las_lengths_beyond_file_are_refused() {
+        let plain = include_bytes!("tests/fixtures/scanner/laspy-14-withheld.las");
+        let with_record = |start: u64, length: u64| {
+            let mut bytes = plain.to_vec();
+            bytes[235..243].copy_from_slice(&start.to_le_bytes());
+            bytes[243..247].copy_from_slice(&1u32.to_le_bytes());
+            bytes.extend([&[0; 20][..], &length.to_le_bytes(), &[0; 32], b"content"].concat());
+            bytes
+        };
+        let end = plain.len() as u64;
+        assert_eq!(las_points(&with_record(end, 7)).unwrap(), las_points(plain).unwrap());
+        for (start, length) in [(end, 8), (end, 1 << 40), (end, u64::MAX), (end + 60, 7), (u64::MAX, 7)] {
+            assert!(las_points(&with_record(start, length)).is_err(), "{length} bytes at {start}");
+        }
+        // The number of points of a file without the older number.
+        let mut bytes = plain.to_vec();
+        bytes[107..111].copy_from_slice(&0u32.to_le_bytes());
+        assert_eq!(las_points(&bytes).unwrap(), las_points(plain).unwrap());
+        for count in [34, u64::MAX, u64::MAX / 30] {
+            bytes[247..255].copy_from_slice(&count.to_le_bytes());
+            assert!(las_points(&bytes).is_err(), "{count} points");
+        }
     }
 
     #[test]
