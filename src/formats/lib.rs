@@ -148,7 +148,7 @@ pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result
         Kind::Lens => wrong("a lens", "give the lens as the nominal"),
         Kind::Cloud(format) => {
             let bytes = whole::open(path)?.read_all(path, whole::MAX_BYTES)?;
-            parse_cloud(path, &bytes, format, table.unit).map(Into::into)
+            parse_cloud(path, &bytes, format, table.unit)
         }
         Kind::Map(format) => format.read_points(path).map(|map| {
             let note = |note| PointNote::Map { path: path.to_owned(), note };

@@ -49,7 +49,7 @@ pub enum PointNote {
         /// Value that was read.
         value_mm: f64,
     },
-    /// A map has content that can be read in more than one way.
+    /// A map has content that can be read in more than one way, or a cloud of points has coarse coordinates.
     Map {
         /// The file.
         path: PathBuf,

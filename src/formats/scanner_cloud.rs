@@ -10,6 +10,7 @@ use e57::RecordDataType;
 use regrind_core::geometry::Point;
 
 use super::error::{FormatError, excerpt};
+use super::note::{NotedPoints, PointNote};
 use super::number::is_believable;
 use super::unit::Unit;
 
@@ -31,8 +32,8 @@ pub(super) fn cloud_format(head: &[u8]) -> Option<CloudFormat> {
     head.starts_with(b"LASF").then_some(CloudFormat::Las)
 }
 
-/// Parses the content of a cloud. Returns its points in millimetres. `unit` is that of a LAS file. `path` only names the
-/// file in messages.
+/// Parses the content of a cloud. Returns its points in millimetres, and for LAS a note on the steps of the coordinates.
+/// `unit` is that of a LAS file. `path` only names the file in messages.
 ///
 /// # Errors
 /// Bytes that are not valid in their format; a LAS file without a given unit, or an E57 file with one; a coordinate beyond
@@ -42,7 +43,8 @@ pub(super) fn parse_cloud(
     bytes: &[u8],
     format: CloudFormat,
     unit: Option<Unit>,
-) -> Result<Vec<Point>, FormatError> {
+) -> Result<NotedPoints, FormatError> {
+    let mut notes = Vec::new();
     let unexpected = |place: &str, expected: &str, found: &str| FormatError::Unexpected {
         path: path.to_owned(),
         place: place.to_owned(),
@@ -53,7 +55,12 @@ pub(super) fn parse_cloud(
         (CloudFormat::E57, None) => e57_points(bytes).map_err(|error| unexpected("file", "E57", &error))?,
         (CloudFormat::E57, Some(_)) => return Err(unexpected("unit", "no unit, because E57 is in metres", "one")),
         (CloudFormat::Las, Some(unit)) => {
-            let points = las_points(bytes).map_err(|error| unexpected("file", "LAS", &error))?;
+            let wrong = |error: String| unexpected("file", "LAS", &error);
+            let [x, y, z] = las_steps(bytes).map_err(wrong)?;
+            let note =
+                format!("its coordinates have steps of {x:e} {unit} in x, {y:e} {unit} in y and {z:e} {unit} in z");
+            notes.push(PointNote::Map { path: path.to_owned(), note });
+            let points = las_points(bytes).map_err(wrong)?;
             points.into_iter().map(|p| p * unit.in_mm()).collect()
         }
         (CloudFormat::Las, None) => {
@@ -70,7 +77,7 @@ pub(super) fn parse_cloud(
             &format!("{}", points[at]),
         ));
     }
-    Ok(points)
+    Ok(NotedPoints { points, notes })
 }
 
 /// Largest difference of the length of a quaternion from 1. Writers round its parts to seven digits and fewer.
@@ -138,6 +145,16 @@ fn e57_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
     Ok(points)
 }
 
+/// Returns the steps of x, y and z in the unit of the file. LAS stores each coordinate as a whole number of steps.
+fn las_steps(bytes: &[u8]) -> Result<[f64; 3], String> {
+    let header = las::raw::Header::read_from(bytes).map_err(|error| error.to_string())?;
+    let steps = [header.x_scale_factor, header.y_scale_factor, header.z_scale_factor];
+    match steps.iter().find(|step| !(**step > 0.0 && step.is_finite())) {
+        Some(step) => Err(format!("the scale {step} of a coordinate, which must be finite and above 0")),
+        None => Ok(steps),
+    }
+}
+
 /// Checks that the points and the extended records that a LAS file states lie within it. The library reserves memory for
 /// them before it reads them.
 fn check_las_lengths(bytes: &[u8]) -> Result<(), String> {
@@ -194,12 +211,15 @@ pub fn parse_scanner_cloud(path: &Path, bytes: &[u8]) -> Result<Vec<Point>, Form
         return Err(FormatError::NoData { path: path.to_owned(), expected: "cloud of a known format" });
     };
     let unit = (format == CloudFormat::Las).then_some(Unit::Metre);
-    parse_cloud(path, bytes, format, unit)
+    parse_cloud(path, bytes, format, unit).map(|read| read.points)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// First byte of the step of z in the header of LAS.
+    const Z_STEP: usize = 147;
 
     /// Returns a file of ten points at 5 m, whose x is said to be an integer from 5 to `most`. y and z can be 0 only.
     fn e57_of_integers(most: i64) -> Vec<u8> {
@@ -246,6 +266,23 @@ mod tests {
         for count in [34, u64::MAX, u64::MAX / 30] {
             bytes[247..255].copy_from_slice(&count.to_le_bytes());
             assert!(las_points(&bytes).is_err(), "{count} points");
+        }
+    }
+
+    /// A coarse step makes all heights of a fine surface alike; the note tells the step.
+    #[test]
+    fn las_steps_are_noted() {
+        let path = Path::new("a.las");
+        let plain = include_bytes!("tests/fixtures/scanner/laspy.las");
+        assert_eq!(las_steps(plain).unwrap(), [1e-7, 1e-7, 1e-10]);
+        let read = parse_cloud(path, plain, CloudFormat::Las, Some(Unit::Metre)).unwrap();
+        let [PointNote::Map { note, .. }] = &read.notes[..] else { panic!("{:?}", read.notes) };
+        assert!(note.contains("1e-10 m in z"), "{note}");
+        for wrong in [0.0, -1e-10, f64::NAN, f64::INFINITY] {
+            let mut bytes = plain.to_vec();
+            bytes[Z_STEP..Z_STEP + 8].copy_from_slice(&f64::to_le_bytes(wrong));
+            let refused = parse_cloud(path, &bytes, CloudFormat::Las, Some(Unit::Metre));
+            assert!(matches!(refused, Err(FormatError::Unexpected { .. })), "{wrong}");
         }
     }
 
