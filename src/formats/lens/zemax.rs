@@ -1,6 +1,7 @@
 //! Surfaces of a lens file of Zemax OpticStudio (`.zmx`).
 //!
-//! A line has a keyword and its values. A block `SURF n` has the lines of a surface, set in by blanks, in any order.
+//! A line has a keyword and its values. A block `SURF n` has the lines of a surface, set in by blanks, in any order; some
+//! programs remove the blanks of all lines.
 //! Lengths are in the unit of `UNIT`. Extra data of a surface stand in lines `XDAT n`, parameters in lines `PARM n`. What
 //! the parameters of each type mean is in the OpticStudio manual (types Standard, Even Asphere, Odd Asphere, Extended
 //! Asphere, Extended Odd Asphere, Toroidal, Biconic, Extended Polynomial, Zernike Standard Sag, Zernike Fringe Sag, Q-Type).
@@ -25,12 +26,32 @@ struct Block {
     semi_diameter: f64,
     parameters: BTreeMap<u32, f64>,
     extra: BTreeMap<u32, f64>,
-    /// Clear aperture: least and largest radius.
-    circle: Option<[f64; 2]>,
-    /// Half-widths of a rectangular aperture.
-    rectangle: Option<[f64; 2]>,
+    outline: Outline,
     centre: [f64; 2],
 }
+
+/// Aperture of a surface as the file has it.
+#[derive(Default)]
+enum Outline {
+    /// None: that of the semi-diameter.
+    #[default]
+    SemiDiameter,
+    /// Least and largest radius.
+    Circle([f64; 2]),
+    /// Half-widths.
+    Rectangle([f64; 2]),
+    /// Half-widths.
+    Ellipse([f64; 2]),
+    /// An outline that the user drew, in a file of its own.
+    Unknown,
+}
+
+/// Largest number of surfaces that are read, so that they need no more memory than fits the file.
+const MAX_SURFACES: usize = 10_000;
+
+/// Keywords of the lines of a surface that are read.
+const OF_SURFACES: [&str; 12] =
+    ["TYPE", "COMM", "CURV", "CONI", "DIAM", "PARM", "XDAT", "CLAP", "SQAP", "ELAP", "USAP", "OBDC"];
 
 /// Reads the surfaces of a lens.
 ///
@@ -40,51 +61,36 @@ pub(super) fn parse_zemax(path: &Path, text: &str) -> Result<LensModel, FormatEr
     let mut blocks: Vec<Block> = Vec::new();
     let mut unit_mm = 1.0;
     let mut is_in_block = false;
+    let is_set_in = has_lines_set_in(text);
     for (i, line) in text.split(['\n', '\r']).enumerate() {
         let mut words = line.split_whitespace();
         let Some(keyword) = words.next() else { continue };
-        let rest: Vec<&str> = words.collect();
-        let wrong = |expected: &str| unexpected(path, &format!("line {}", i + 1), expected, line);
-        let number = |at: usize| -> Result<f64, FormatError> {
-            let value = rest.get(at).and_then(|word| word.parse::<f64>().ok()).filter(|value| value.is_finite());
-            value.ok_or_else(|| wrong("a number"))
-        };
+        let line = Line { path, number: i + 1, text: line, values: words.collect() };
         if keyword == "SURF" {
-            let number =
-                rest.first().and_then(|word| word.parse().ok()).ok_or_else(|| wrong("the number of a surface"))?;
+            let number = line.whole(0, "the number of a surface")? as usize;
+            if blocks.len() == MAX_SURFACES {
+                return Err(line.wrong(&format!("at most {MAX_SURFACES} surfaces")));
+            }
             blocks.push(Block { number, kind: "STANDARD".to_owned(), ..Block::default() });
             is_in_block = true;
             continue;
         }
-        is_in_block &= line.starts_with([' ', '\t']);
-        if keyword == "UNIT" && !is_in_block {
-            unit_mm = match rest.first().copied().unwrap_or_default() {
+        let belongs = !is_set_in || line.text.starts_with([' ', '\t']);
+        is_in_block &= belongs;
+        if keyword == "UNIT" && (blocks.is_empty() || !belongs) {
+            unit_mm = match line.values.first().copied().unwrap_or_default() {
                 "MM" => 1.0,
                 "CM" => 10.0,
                 "IN" | "INCH" | "INCHES" => 25.4,
                 "M" | "METER" | "METERS" => 1e3,
-                _ => return Err(wrong("the unit MM, CM, IN or METER")),
+                _ => return Err(line.wrong("the unit MM, CM, IN or METER")),
             };
         }
-        let (true, Some(block)) = (is_in_block, blocks.last_mut()) else { continue };
-        // A value with an index, such as `PARM 1 0.5`.
-        let indexed = || -> Result<(u32, f64), FormatError> {
-            let index =
-                rest.first().and_then(|word| word.parse().ok()).ok_or_else(|| wrong("an index and a number"))?;
-            Ok((index, number(1)?))
-        };
-        match keyword {
-            "TYPE" => block.kind = rest.first().copied().unwrap_or("STANDARD").to_owned(),
-            "COMM" => block.comment = rest.join(" "),
-            "CURV" => block.curvature = number(0)?,
-            "CONI" => block.conic = number(0)?,
-            "DIAM" => block.semi_diameter = number(0)?,
-            "PARM" => drop(indexed().map(|(index, value)| block.parameters.insert(index, value))?),
-            "XDAT" => drop(indexed().map(|(index, value)| block.extra.insert(index, value))?),
-            "CLAP" => block.circle = Some([number(0)?, number(1)?]),
-            "SQAP" => block.rectangle = Some([number(0)?, number(1)?]),
-            "OBDC" => block.centre = [number(0)?, number(1)?],
-            _ => {}
+        let Some(block) = blocks.last_mut() else { continue };
+        if is_in_block {
+            block.take_line(keyword, &line)?;
+        } else if OF_SURFACES.contains(&keyword) {
+            return Err(line.wrong("a line of a surface to be set in by blanks, as the others are"));
         }
     }
     if blocks.is_empty() {
@@ -93,16 +99,68 @@ pub(super) fn parse_zemax(path: &Path, text: &str) -> Result<LensModel, FormatEr
     Ok(LensModel { surfaces: blocks.iter().map(|block| block.surface(unit_mm)).collect() })
 }
 
-fn unexpected(path: &Path, place: &str, expected: &str, found: &str) -> FormatError {
-    FormatError::Unexpected {
-        path: path.to_owned(),
-        place: place.to_owned(),
-        expected: expected.to_owned(),
-        found: excerpt(found.trim().as_bytes()),
+/// Returns true if a line behind the first `SURF` is set in by blanks. In a file without any, blanks were removed, and a
+/// surface ends at the next `SURF`.
+fn has_lines_set_in(text: &str) -> bool {
+    let mut lines = text.split(['\n', '\r']).skip_while(|line| !line.trim_start().starts_with("SURF"));
+    lines.any(|line| line.starts_with([' ', '\t']) && !line.trim().is_empty() && !line.trim().starts_with("SURF"))
+}
+
+/// Line of the file: its values behind the keyword.
+struct Line<'a> {
+    path: &'a Path,
+    number: usize,
+    text: &'a str,
+    values: Vec<&'a str>,
+}
+
+impl Line<'_> {
+    fn wrong(&self, expected: &str) -> FormatError {
+        FormatError::Unexpected {
+            path: self.path.to_owned(),
+            place: format!("line {}", self.number),
+            expected: expected.to_owned(),
+            found: excerpt(self.text.trim().as_bytes()),
+        }
+    }
+
+    fn whole(&self, at: usize, expected: &str) -> Result<u32, FormatError> {
+        self.values.get(at).and_then(|word| word.parse().ok()).ok_or_else(|| self.wrong(expected))
+    }
+
+    fn number(&self, at: usize) -> Result<f64, FormatError> {
+        let value = self.values.get(at).and_then(|word| word.parse::<f64>().ok()).filter(|value| value.is_finite());
+        value.ok_or_else(|| self.wrong("a number"))
+    }
+
+    /// Returns a value with its index, such as those of `PARM 1 0.5`.
+    fn indexed(&self) -> Result<(u32, f64), FormatError> {
+        Ok((self.whole(0, "an index and a number")?, self.number(1)?))
     }
 }
 
 impl Block {
+    /// Takes a line of this surface.
+    fn take_line(&mut self, keyword: &str, line: &Line<'_>) -> Result<(), FormatError> {
+        let pair = || -> Result<[f64; 2], FormatError> { Ok([line.number(0)?, line.number(1)?]) };
+        match keyword {
+            "TYPE" => self.kind = line.values.first().copied().unwrap_or("STANDARD").to_owned(),
+            "COMM" => self.comment = line.values.join(" "),
+            "CURV" => self.curvature = line.number(0)?,
+            "CONI" => self.conic = line.number(0)?,
+            "DIAM" => self.semi_diameter = line.number(0)?,
+            "PARM" => drop(line.indexed().map(|(index, value)| self.parameters.insert(index, value))?),
+            "XDAT" => drop(line.indexed().map(|(index, value)| self.extra.insert(index, value))?),
+            "CLAP" => self.outline = Outline::Circle(pair()?),
+            "SQAP" => self.outline = Outline::Rectangle(pair()?),
+            "ELAP" => self.outline = Outline::Ellipse(pair()?),
+            "USAP" => self.outline = Outline::Unknown,
+            "OBDC" => self.centre = pair()?,
+            _ => {}
+        }
+        Ok(())
+    }
+
     fn surface(&self, unit_mm: f64) -> LensSurface {
         let has_terms = self.parameters.values().chain(self.extra.values()).any(|value| *value != 0.0);
         LensSurface {
@@ -118,15 +176,19 @@ impl Block {
     /// Returns the aperture that is stated, else the disc of the semi-diameter.
     fn aperture(&self, unit_mm: f64) -> Option<Aperture> {
         let centre_mm = self.centre.map(|c| c * unit_mm);
-        let aperture = match (self.rectangle, self.circle) {
-            (Some([x, y]), _) => {
+        let aperture = match self.outline {
+            Outline::Rectangle([x, y]) => {
                 Aperture::Rectangle { centre_mm, width_mm: 2.0 * x * unit_mm, height_mm: 2.0 * y * unit_mm }
             }
-            (None, Some([inner, outer])) if inner > 0.0 => {
+            Outline::Ellipse(semi_axes) => {
+                Aperture::Ellipse { centre_mm, semi_axes_mm: semi_axes.map(|semi_axis| semi_axis * unit_mm) }
+            }
+            Outline::Circle([inner, outer]) if inner > 0.0 => {
                 Aperture::Annulus { centre_mm, inner_radius_mm: inner * unit_mm, outer_radius_mm: outer * unit_mm }
             }
-            (None, Some([_, outer])) => Aperture::Circle { centre_mm, radius_mm: outer * unit_mm },
-            (None, None) => Aperture::Circle { centre_mm: [0.0; 2], radius_mm: self.semi_diameter * unit_mm },
+            Outline::Circle([_, outer]) => Aperture::Circle { centre_mm, radius_mm: outer * unit_mm },
+            Outline::SemiDiameter => Aperture::Circle { centre_mm: [0.0; 2], radius_mm: self.semi_diameter * unit_mm },
+            Outline::Unknown => return None,
         };
         aperture.validate().is_ok().then_some(aperture)
     }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use regrind_core::geometry::Aperture;
 use regrind_core::surface::SurfaceChoice;
 use regrind_core::surface::analytic::Sampling;
-use regrind_formats::{ChoiceError, parse_lens, read_lens};
+use regrind_formats::{ChoiceError, FormatError, parse_lens, read_lens};
 
 fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/lens")
@@ -103,6 +103,43 @@ fn surface_of_lens_is_chosen() {
     assert!(matches!(unknown, Err(ChoiceError::Unreadable { number: 4, .. })));
     let missing = ChoiceError::NoSurface { number: 9, numbers: vec![0, 1, 2, 3, 4] };
     assert_eq!(lens.choose(Some(&SurfaceChoice::Number(9))), Err(missing));
+}
+
+/// Some programs remove the blanks in front of all lines. If only some lines lack them, the file is damaged.
+#[test]
+fn lines_of_zemax_without_blanks_are_read() {
+    let path = Path::new("a.zmx");
+    for name in ["EVENASPH-mm-utf8.zmx", "XPOLYNOM-in-utf8.zmx"] {
+        let text = std::fs::read_to_string(folder().join(name)).unwrap();
+        let stripped: String = text.lines().map(|line| format!("{}\n", line.trim_start())).collect();
+        let [stripped, plain] = [&stripped, &text].map(|text| parse_lens(path, text.as_bytes()).unwrap());
+        assert_eq!(stripped, plain, "{name}");
+        let one = text.replacen("  CONI", "CONI", 1);
+        let refused = parse_lens(path, one.as_bytes());
+        assert!(matches!(refused, Err(FormatError::Unexpected { .. })), "{name}: {refused:?}");
+    }
+}
+
+/// An elliptic aperture is an outline. One that the user drew is in another file: an aperture must be given.
+#[test]
+fn other_apertures_of_zemax_are_known() {
+    let path = Path::new("a.zmx");
+    let text = std::fs::read_to_string(folder().join("EVENASPH-mm-utf8.zmx")).unwrap();
+    let aperture = |line: &str| {
+        let lens = parse_lens(path, text.replacen("  CONI", &format!("  {line}\n  OBDC 1 -2\n  CONI"), 1).as_bytes());
+        lens.unwrap().choose(None).unwrap().aperture.clone()
+    };
+    let ellipse = Aperture::Ellipse { centre_mm: [1.0, -2.0], semi_axes_mm: [4.0, 3.0] };
+    assert_eq!(aperture("ELAP 4 3 0"), Some(ellipse));
+    assert_eq!(aperture("USAP 4 3 0"), None);
+}
+
+/// Surfaces need more memory than their lines have bytes.
+#[test]
+fn too_many_surfaces_are_refused() {
+    let path = Path::new("a.zmx");
+    let zemax = format!("UNIT MM\n{}", "SURF 1\n".repeat(10_001));
+    assert!(matches!(parse_lens(path, zemax.as_bytes()), Err(FormatError::Unexpected { .. })));
 }
 
 #[test]
