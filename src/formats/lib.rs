@@ -64,7 +64,7 @@ pub use form_document::save_form;
 pub use height_map::HeightMap;
 pub use jsonl_appender::JsonlAppender;
 pub use learned::{CellRun, KnowledgeOrigin, Learned, LearnedError, SettingIdentity};
-pub use lens::{LensModel, LensSurface, parse_lens, read_lens};
+pub use lens::{LensModel, LensSurface, TermsDisc, parse_lens, read_lens};
 pub use map::{
     CorrectionIdentities, ErrorMapOrigin, MapNode, parse_error_map, read_error_map, write_correction, write_error_map,
 };

@@ -11,7 +11,7 @@ use regrind_core::geometry::Aperture;
 
 use super::super::error::{FormatError, excerpt};
 use super::build::{Base, Built, polynomial_order, sum, zernike};
-use super::model::{LensModel, LensSurface};
+use super::model::{LensModel, LensSurface, TermsDisc};
 
 /// Letters of the coefficients of r^4 to r^20. Code V has no I.
 const LETTERS: [&str; 9] = ["A", "B", "C", "D", "E", "F", "G", "H", "J"];
@@ -262,6 +262,7 @@ impl Block {
             kind: kind.to_owned(),
             is_curved: curvature.as_ref().map_or(true, |curvature| *curvature != 0.0) || has_terms,
             aperture: self.aperture(unit),
+            disc: self.terms_disc(unit),
             surface: match (unit_mm, curvature) {
                 (None, _) => Err("the file has no unit; add a statement DIM".to_owned()),
                 (_, Err(reason)) => Err(reason),
@@ -273,6 +274,12 @@ impl Block {
                 },
             },
         }
+    }
+
+    /// Returns the disc of the Zernike terms: what Code V makes of them outside is not known.
+    fn terms_disc(&self, unit: f64) -> Option<TermsDisc> {
+        let radius_mm = (self.kind == "ZFR").then(|| self.normalisation("C3").ok())?? * unit;
+        Some(TermsDisc { centre_mm: [0.0; 2], radius_mm })
     }
 
     /// Returns the curvature in 1/unit.

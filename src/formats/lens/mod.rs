@@ -7,7 +7,7 @@ mod zemax;
 
 use std::path::Path;
 
-pub use model::{LensModel, LensSurface};
+pub use model::{LensModel, LensSurface, TermsDisc};
 
 use super::error::{FormatError, excerpt};
 use super::whole;

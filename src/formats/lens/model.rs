@@ -2,7 +2,7 @@
 
 use regrind_core::geometry::Aperture;
 use regrind_core::surface::SurfaceChoice;
-use regrind_core::surface::analytic::{AnalyticSurface, DefinedSurface, Sampling};
+use regrind_core::surface::analytic::{AnalyticSurface, DefinedSurface, DefinitionError, Sampling};
 
 use super::super::choice_error::{ChoiceError, number_of};
 
@@ -21,8 +21,39 @@ pub struct LensSurface {
     pub is_curved: bool,
     /// Outline in the file.
     pub aperture: Option<Aperture>,
+    /// Disc outside of which the file does not define the surface; `None` if it has no such limit.
+    pub disc: Option<TermsDisc>,
     /// The surface, or the reason why it cannot be taken.
     pub surface: Result<AnalyticSurface, String>,
+}
+
+/// Number of points of an outline that are held against the disc.
+const OUTLINE_POINTS: usize = 720;
+
+/// Part of the normalisation radius by which rounding may move an outline beyond it.
+const ROUNDING: f64 = 1e-9;
+
+/// Disc on which the Zernike terms of a surface are defined.
+///
+/// Frame: that of the surface. Units: millimetres.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TermsDisc {
+    /// Its middle.
+    pub centre_mm: [f64; 2],
+    /// Its radius, the normalisation radius of the terms.
+    pub radius_mm: f64,
+}
+
+impl TermsDisc {
+    /// Returns the distance in mm from the middle to the farthest point of `aperture`.
+    fn reach_mm(&self, aperture: &Aperture) -> f64 {
+        let distance = |[x, y]: &[f64; 2]| (x - self.centre_mm[0]).hypot(y - self.centre_mm[1]);
+        match aperture {
+            Aperture::Circle { centre_mm, radius_mm: radius }
+            | Aperture::Annulus { centre_mm, outer_radius_mm: radius, .. } => distance(centre_mm) + radius,
+            _ => aperture.outline_mm(OUTLINE_POINTS).iter().map(distance).fold(0.0, f64::max),
+        }
+    }
 }
 
 /// Surfaces of a lens, in the order of the file.
@@ -75,13 +106,23 @@ impl LensSurface {
     ///
     /// # Errors
     /// Returns an error if the surface cannot be taken, if there is no outline, or if the surface is not defined within
-    /// it.
+    /// it, such as where the outline reaches beyond the disc of the Zernike terms.
     pub fn defined(&self, aperture: Option<Aperture>, sampling: Sampling) -> Result<DefinedSurface, ChoiceError> {
         let unreadable =
             |reason: String| ChoiceError::Unreadable { number: self.number, kind: self.kind.clone(), reason };
-        let surface = self.surface.clone().map_err(unreadable)?;
+        let surface = self.surface.clone().map_err(&unreadable)?;
         let aperture = aperture.or_else(|| self.aperture.clone());
         let aperture = aperture.ok_or(ChoiceError::NoOutline { number: self.number })?;
+        aperture.validate().map_err(DefinitionError::Aperture)?;
+        if let Some(disc) = &self.disc {
+            let (reach_mm, radius_mm) = (disc.reach_mm(&aperture), disc.radius_mm);
+            if reach_mm > radius_mm * (1.0 + ROUNDING) {
+                return Err(unreadable(format!(
+                    "its outline reaches {reach_mm} mm from the centre of its Zernike terms, beyond their normalisation \
+                     radius of {radius_mm} mm, where the file does not define them; give a smaller aperture"
+                )));
+            }
+        }
         Ok(DefinedSurface::new(surface, aperture, sampling)?)
     }
 }

@@ -13,7 +13,7 @@ use regrind_core::geometry::Aperture;
 
 use super::super::error::{FormatError, excerpt};
 use super::build::{Base, Built, polynomial_order, sum, zernike};
-use super::model::{LensModel, LensSurface};
+use super::model::{LensModel, LensSurface, TermsDisc};
 
 /// Surface as the file has it.
 #[derive(Default)]
@@ -169,8 +169,25 @@ impl Block {
             kind: self.kind.clone(),
             is_curved: self.kind != "COORDBRK" && (self.curvature != 0.0 || (self.kind != "STANDARD" && has_terms)),
             aperture: self.aperture(unit_mm),
+            disc: self.terms_disc(unit_mm),
             surface: self.built(unit_mm),
         }
+    }
+
+    /// Returns the disc of the Zernike terms, if they are not extrapolated: outside they are left out, with a step.
+    fn terms_disc(&self, unit_mm: f64) -> Option<TermsDisc> {
+        let has_terms = matches!(&self.kind[..], "TOROIDAL" | "SZERNSAG" | "FZERNSAG")
+            && self.extras(3, self.extra(1)).is_ok_and(|values| values.iter().any(|value| *value != 0.0));
+        let is_extrapolated = self.parameter(0) != 0.0;
+        (has_terms && !is_extrapolated)
+            .then(|| TermsDisc { centre_mm: self.terms_shift_mm(unit_mm), radius_mm: self.extra(2) * unit_mm })
+    }
+
+    /// Returns the place in mm of the centre of the Zernike terms.
+    fn terms_shift_mm(&self, unit_mm: f64) -> [f64; 2] {
+        // A toroid has no decentre of its terms: its parameters 9 and 10 are not used.
+        let shift = if self.kind == "TOROIDAL" { [0.0; 2] } else { [self.parameter(9), self.parameter(10)] };
+        shift.map(|s| s * unit_mm)
     }
 
     /// Returns the aperture that is stated, else the disc of the semi-diameter.
@@ -272,18 +289,8 @@ impl Block {
             return base;
         }
         let radius_mm = self.radius(self.extra(2))? * unit_mm;
-        // A toroid has no decentre of its terms: its parameters 9 and 10 are not used.
-        let shift = if self.kind == "TOROIDAL" { [0.0; 2] } else { [self.parameter(9), self.parameter(10)] };
-        let shift = shift.map(|s| s * unit_mm);
-        let reach_mm = self.semi_diameter * unit_mm + shift[0].hypot(shift[1]);
-        // Without extrapolation the terms end at the normalisation radius: there the surface would have a step.
-        if self.parameter(0) == 0.0 && reach_mm > radius_mm * (1.0 + 1e-9) {
-            return Err(format!(
-                "its Zernike terms end at the normalisation radius of {radius_mm} mm, within the surface of {reach_mm} mm"
-            ));
-        }
         let coefficients: Vec<f64> = values.iter().map(|a| a * unit_mm).collect();
-        sum(base, zernike(is_fringe, radius_mm, &coefficients), shift)
+        sum(base, zernike(is_fringe, radius_mm, &coefficients), self.terms_shift_mm(unit_mm))
     }
 
     fn radius(&self, value: f64) -> Result<f64, String> {

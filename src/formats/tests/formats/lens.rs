@@ -134,6 +134,42 @@ fn other_apertures_of_zemax_are_known() {
     assert_eq!(aperture("USAP 4 3 0"), None);
 }
 
+/// Zernike terms that are not extrapolated end at the normalisation radius about their centre. The outline decides,
+/// whether the file states it or an aperture is given.
+#[test]
+fn zernike_terms_end_at_their_disc() {
+    let sampling = Sampling::Spacing { spacing_mm: 1.0 };
+    let circle = |radius_mm: f64| Some(Aperture::Circle { centre_mm: [0.0; 2], radius_mm });
+    let is_beyond = |text: &str, aperture: Option<Aperture>| {
+        let lens = parse_lens(Path::new("a"), text.as_bytes()).unwrap();
+        match lens.choose(Some(&SurfaceChoice::Number(1))).unwrap().defined(aperture, sampling) {
+            Ok(_) => false,
+            Err(ChoiceError::Unreadable { number: 1, .. }) => true,
+            Err(other) => panic!("{other}"),
+        }
+    };
+    // The terms have the radius 18 mm, and their centre is at (1.5, -2.25) mm, 2.704 mm from the axis.
+    let text = std::fs::read_to_string(folder().join("SZERNSAG-decentred-mm-utf8.zmx")).unwrap();
+    let zemax = |is_extrapolated: u8| {
+        let kept: String =
+            text.lines().filter(|line| !line.starts_with("  PARM 0 ")).map(|line| format!("{line}\n")).collect();
+        kept.replacen("  CONI", &format!("  PARM 0 {is_extrapolated}\n  CONI"), 1)
+    };
+    assert!(!is_beyond(&zemax(0), None) && !is_beyond(&zemax(0), circle(15.29)));
+    assert!(is_beyond(&zemax(0), circle(15.31)) && !is_beyond(&zemax(1), circle(15.31)));
+    let rectangle = |width_mm: f64| Some(Aperture::Rectangle { centre_mm: [1.5, -2.25], width_mm, height_mm: 20.0 });
+    // A corner is sqrt(14.966^2 + 10^2) = 18 mm away.
+    assert!(!is_beyond(&zemax(0), rectangle(29.93)) && is_beyond(&zemax(0), rectangle(29.94)));
+    let larger = zemax(0).replacen("  DIAM 1.5", "  DIAM 1.6", 1);
+    assert!(is_beyond(&larger, None) && !is_beyond(&larger, circle(15.0)));
+    // Terms without values, and terms of another surface, have no disc.
+    let plain = zemax(0).replacen("  XDAT 1 2.2", "  XDAT 1 0.0", 1);
+    assert!(!is_beyond(&plain, circle(20.0)));
+
+    let codev = std::fs::read_to_string(folder().join("CV-ZFR-mm.seq")).unwrap();
+    assert!(!is_beyond(&codev, circle(18.0)) && is_beyond(&codev, circle(18.1)));
+}
+
 /// Surfaces need more memory than their lines have bytes.
 #[test]
 fn too_many_surfaces_are_refused() {
