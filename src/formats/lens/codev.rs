@@ -5,7 +5,9 @@
 //! (`K S2 -1`). `DIM M` is millimetre. `RDM` says that the number of `S` is a radius.
 
 use std::collections::BTreeMap;
+use std::iter::Peekable;
 use std::path::Path;
+use std::str::Chars;
 
 use regrind_core::geometry::Aperture;
 
@@ -45,7 +47,7 @@ struct Block {
 /// Text that is not a sequence file; a unit that is not known; a value that is not a number.
 pub(super) fn parse_codev(path: &Path, text: &str) -> Result<LensModel, FormatError> {
     let mut reader = Reader { path, blocks: Vec::new(), unit_mm: None, has_radii: None };
-    for (line, statement) in statements(text) {
+    for (line, statement) in Statements::new(text) {
         reader.take_statement(line, &statement)?;
     }
     let Reader { blocks, unit_mm, has_radii, .. } = reader;
@@ -56,56 +58,100 @@ pub(super) fn parse_codev(path: &Path, text: &str) -> Result<LensModel, FormatEr
     Ok(LensModel { surfaces })
 }
 
-/// Divides a text into statements of words, each with the number of its line. A text in quotes is one word.
-fn statements(text: &str) -> Vec<(usize, Vec<String>)> {
-    let mut statements = Vec::new();
-    let (mut words, mut word, mut begin, mut line) = (Vec::new(), String::new(), 1, 1);
-    let mut quote: Option<char> = None;
-    let mut chars = text.chars().peekable();
-    while let Some(c) = chars.next() {
-        if let Some(mark) = quote {
-            // A text ends with its line, whatever quotes say.
-            if c == mark || c == '\n' {
-                quote = None;
-                words.push(std::mem::take(&mut word));
-            } else {
-                word.push(c);
+/// Word of a statement. A text in quotes is one word, and neither a keyword nor a number.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Word {
+    text: String,
+    is_quoted: bool,
+}
+
+impl Word {
+    /// Returns the word in upper case; empty for a text in quotes.
+    pub(super) fn keyword(&self) -> String {
+        if self.is_quoted { String::new() } else { self.text.to_uppercase() }
+    }
+}
+
+/// Statements of a text, each with the number of its line.
+pub(super) struct Statements<'a> {
+    rest: Peekable<Chars<'a>>,
+    line: usize,
+}
+
+impl<'a> Statements<'a> {
+    pub(super) fn new(text: &'a str) -> Self {
+        Self { rest: text.chars().peekable(), line: 1 }
+    }
+
+    /// Reads a text up to its closing `mark`; a doubled mark is one of the text. It ends with its line, whatever quotes
+    /// say.
+    fn quoted(&mut self, mark: char) -> Word {
+        let mut text = String::new();
+        while let Some(c) = self.rest.next_if(|c| !is_line_end(*c)) {
+            if c == mark && self.rest.next_if_eq(&mark).is_none() {
+                break;
             }
-            if c != '\n' {
-                continue;
-            }
+            text.push(c);
         }
-        let is_end = matches!(c, ';' | '\n' | '\r');
-        if (c.is_whitespace() || is_end || c == '!' || c == '&' || c == '\'' || c == '"') && !word.is_empty() {
-            words.push(std::mem::take(&mut word));
-        }
-        match c {
-            '!' => while chars.next_if(|c| *c != '\n').is_some() {},
-            // The statement goes on in the next line.
-            '&' => {
-                while chars.next_if(|c| *c != '\n').is_some() {}
-                chars.next();
-                line += 1;
+        Word { text, is_quoted: true }
+    }
+
+    /// Returns true if nothing, or a comment, stands in the rest of the line.
+    fn is_at_end_of_line(&self) -> bool {
+        let mut rest = self.rest.clone().take_while(|c| !is_line_end(*c));
+        rest.find(|c| !c.is_whitespace()).is_none_or(|c| c == '!')
+    }
+
+    fn skip_line(&mut self) {
+        while self.rest.next_if(|c| !is_line_end(*c)).is_some() {}
+    }
+}
+
+fn is_line_end(c: char) -> bool {
+    matches!(c, '\n' | '\r')
+}
+
+impl Iterator for Statements<'_> {
+    type Item = (usize, Vec<Word>);
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let (mut words, mut word, mut begin) = (Vec::new(), String::new(), self.line);
+        let close = |word: &mut String, words: &mut Vec<Word>| {
+            if !word.is_empty() {
+                words.push(Word { text: std::mem::take(word), is_quoted: false });
             }
-            '\'' | '"' => quote = Some(c),
-            _ if is_end => {
-                if !words.is_empty() {
-                    statements.push((begin, std::mem::take(&mut words)));
+        };
+        while let Some(c) = self.rest.next() {
+            match c {
+                '!' => self.skip_line(),
+                '&' if self.is_at_end_of_line() => {
+                    close(&mut word, &mut words);
+                    self.skip_line();
+                    self.rest.next_if_eq(&'\r');
+                    self.rest.next_if_eq(&'\n');
+                    self.line += 1;
                 }
-                line += usize::from(c == '\n');
-                begin = line;
+                '\'' | '"' => {
+                    close(&mut word, &mut words);
+                    words.push(self.quoted(c));
+                }
+                ';' | '\n' | '\r' => {
+                    close(&mut word, &mut words);
+                    // Lines end with LF, CR LF or CR.
+                    let is_first_of_two = c == '\r' && self.rest.peek() == Some(&'\n');
+                    self.line += usize::from(is_line_end(c) && !is_first_of_two);
+                    if !words.is_empty() {
+                        return Some((begin, words));
+                    }
+                    begin = self.line;
+                }
+                c if c.is_whitespace() => close(&mut word, &mut words),
+                c => word.push(c),
             }
-            c if c.is_whitespace() => {}
-            c => word.push(c),
         }
+        close(&mut word, &mut words);
+        (!words.is_empty()).then_some((begin, words))
     }
-    if !word.is_empty() {
-        words.push(word);
-    }
-    if !words.is_empty() {
-        statements.push((begin, words));
-    }
-    statements
 }
 
 struct Reader<'a> {
@@ -120,7 +166,7 @@ struct Reader<'a> {
 struct Statement<'a> {
     path: &'a Path,
     line: usize,
-    words: &'a [String],
+    words: &'a [Word],
 }
 
 impl Statement<'_> {
@@ -129,27 +175,30 @@ impl Statement<'_> {
             path: self.path.to_owned(),
             place: format!("line {}", self.line),
             expected: expected.to_owned(),
-            found: excerpt(self.words.join(" ").as_bytes()),
+            found: excerpt(self.words.iter().map(|word| &word.text[..]).collect::<Vec<_>>().join(" ").as_bytes()),
         }
     }
 
-    /// Returns a word in upper case; empty if there is none.
+    /// Returns a word in upper case; empty if there is none, or a text in quotes.
     fn word(&self, at: usize) -> String {
-        self.words.get(at).map(|word| word.to_uppercase()).unwrap_or_default()
+        self.words.get(at).map(Word::keyword).unwrap_or_default()
     }
 
     fn value(&self, at: usize) -> Result<f64, FormatError> {
-        let value = self.words.get(at).and_then(|word| word.parse::<f64>().ok()).filter(|value| value.is_finite());
-        value.ok_or_else(|| self.wrong("a number"))
+        self.number(at).filter(|value| value.is_finite()).ok_or_else(|| self.wrong("a number"))
     }
 
     fn is_number(&self, at: usize) -> bool {
-        self.words.get(at).is_some_and(|word| word.parse::<f64>().is_ok())
+        self.number(at).is_some()
+    }
+
+    fn number(&self, at: usize) -> Option<f64> {
+        self.words.get(at).filter(|word| !word.is_quoted).and_then(|word| word.text.parse().ok())
     }
 }
 
 impl Reader<'_> {
-    fn take_statement(&mut self, line: usize, words: &[String]) -> Result<(), FormatError> {
+    fn take_statement(&mut self, line: usize, words: &[Word]) -> Result<(), FormatError> {
         let statement = Statement { path: self.path, line, words };
         let keyword = statement.word(0);
         match keyword.as_str() {
@@ -233,7 +282,7 @@ impl Block {
             "CUY" => self.curvature = Some(statement.value(at)?),
             "RDX" => self.radius_x = statement.value(at)?,
             "CUX" => self.curvature_x = Some(statement.value(at)?),
-            "SLB" => self.label = statement.words.get(at).cloned().unwrap_or_default(),
+            "SLB" => self.label = statement.words.get(at).map(|word| word.text.clone()).unwrap_or_default(),
             "CIR" if statement.is_number(at) => self.circle = Some(statement.value(at)?),
             "REX" if statement.is_number(at) => self.rectangle[0] = Some(statement.value(at)?),
             "REY" if statement.is_number(at) => self.rectangle[1] = Some(statement.value(at)?),
@@ -373,21 +422,44 @@ impl Block {
 mod tests {
     use super::*;
 
+    fn statements(text: &str) -> Vec<(usize, Vec<String>)> {
+        // Marks texts in quotes.
+        let shown = |word: &Word| if word.is_quoted { format!("<{}>", word.text) } else { word.text.clone() };
+        Statements::new(text).map(|(line, words)| (line, words.iter().map(shown).collect())).collect()
+    }
+
     #[test]
     fn statements_by_hand() {
         let text = "rdm;len\ntitle 'one; two' ! a comment; more\ns 85.0 5 \"N;BK7\"\nasp; k -0.7; b 1 &\nc 2\n";
-        let found = statements(text);
-        let words: Vec<Vec<&str>> = found.iter().map(|(_, words)| words.iter().map(String::as_str).collect()).collect();
-        let expected: [&[&str]; 7] = [
-            &["rdm"],
-            &["len"],
-            &["title", "one; two"],
-            &["s", "85.0", "5", "N;BK7"],
-            &["asp"],
-            &["k", "-0.7"],
-            &["b", "1", "c", "2"],
+        let expected: [(usize, &[&str]); 7] = [
+            (1, &["rdm"]),
+            (1, &["len"]),
+            (2, &["title", "<one; two>"]),
+            (3, &["s", "85.0", "5", "<N;BK7>"]),
+            (4, &["asp"]),
+            (4, &["k", "-0.7"]),
+            (4, &["b", "1", "c", "2"]),
         ];
-        assert_eq!(words, expected);
-        assert_eq!(found[3].0, 3);
+        let expected: Vec<(usize, Vec<String>)> =
+            expected.map(|(line, words)| (line, words.iter().map(ToString::to_string).collect())).to_vec();
+        assert_eq!(statements(text), expected);
+    }
+
+    #[test]
+    fn quotes_and_continuations_by_hand() {
+        let words = |text: &str| -> Vec<Vec<String>> { statements(text).into_iter().map(|(_, words)| words).collect() };
+        assert_eq!(words("slb 'it''s; one' 2"), [["slb", "<it's; one>", "2"]]);
+        assert_eq!(words("gla \"a 'b' ! c & d\""), [["gla", "<a 'b' ! c & d>"]]);
+        assert_eq!(words("slb ''\r\nk 1"), [vec!["slb", "<>"], vec!["k", "1"]]);
+        // A text that is not closed ends with its line.
+        assert_eq!(words("tit 'open; s 1\r\nk 1"), [vec!["tit", "<open; s 1>"], vec!["k", "1"]]);
+        // A mark of continuation is the last one of its line.
+        assert_eq!(words("tit a & b\nk 1"), [vec!["tit", "a", "&", "b"], vec!["k", "1"]]);
+        assert_eq!(words("a 1& ! more\r\n2; b"), [vec!["a", "1", "2"], vec!["b"]]);
+        for end in ["\n", "\r\n", "\r"] {
+            let text = ["! s 1", "a &", "1", "", "b"].join(end);
+            let found: Vec<usize> = statements(&text).into_iter().map(|(line, _)| line).collect();
+            assert_eq!(found, [2, 5], "{end:?}");
+        }
     }
 }

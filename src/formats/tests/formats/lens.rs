@@ -170,6 +170,17 @@ fn zernike_terms_end_at_their_disc() {
     assert!(!is_beyond(&codev, circle(18.0)) && is_beyond(&codev, circle(18.1)));
 }
 
+/// A label in quotes can look like the name of a surface, a keyword or a number.
+#[test]
+fn label_of_code_v_in_quotes_is_text() {
+    let text = std::fs::read_to_string(folder().join("CV-SPH-mm.seq")).unwrap();
+    for label in ["S0", "S99", "K", "1.5", "front & back; no. 1"] {
+        let text = text.replacen("  STO", &format!("  STO\n  SLB '{label}'"), 1);
+        let lens = parse_lens(Path::new("a.seq"), text.as_bytes()).unwrap();
+        assert_eq!(lens.choose(Some(&SurfaceChoice::Name(label.into()))).unwrap().number, 1, "{label}");
+    }
+}
+
 /// Surfaces need more memory than their lines have bytes.
 #[test]
 fn too_many_surfaces_are_refused() {
