@@ -18,6 +18,15 @@ use super::model::{LensModel, LensSurface, TermsDisc};
 /// Letters of the coefficients of r^4 to r^20. Code V has no I.
 const LETTERS: [&str; 9] = ["A", "B", "C", "D", "E", "F", "G", "H", "J"];
 
+/// Largest number of surfaces that are read, so that they need no more memory than fits the file.
+const MAX_SURFACES: usize = 10_000;
+
+/// Keywords of the statements about a surface that are read, besides the letters.
+const OF_SURFACES: [&str; 27] = [
+    "SPH", "CON", "ASP", "YTO", "XTO", "CYL", "AAS", "DIF", "GRX", "UDS", "CUF", "SPS", "SCO", "K", "RDY", "CUY",
+    "RDX", "CUX", "SLB", "CIR", "REX", "REY", "ADX", "ADY", "ARO", "ELX", "ELY",
+];
+
 /// Surface as the file has it.
 #[derive(Clone, Default)]
 struct Block {
@@ -26,11 +35,9 @@ struct Block {
     kind: String,
     /// Number of the `S` statement: a radius or a curvature.
     value: f64,
-    /// Curvature or radius that a statement `CUY` or `RDY` gives.
+    /// Curvature that the last statement `CUY` or `RDY` gives, and that of `CUX` or `RDX`.
     curvature: Option<f64>,
-    radius: Option<f64>,
-    radius_x: f64,
-    curvature_x: Option<f64>,
+    curvature_x: f64,
     conic: f64,
     letters: BTreeMap<usize, f64>,
     special: BTreeMap<String, f64>,
@@ -47,8 +54,16 @@ struct Block {
 /// Text that is not a sequence file; a unit that is not known; a value that is not a number.
 pub(super) fn parse_codev(path: &Path, text: &str) -> Result<LensModel, FormatError> {
     let mut reader = Reader { path, blocks: Vec::new(), unit_mm: None, has_radii: None };
-    for (line, statement) in Statements::new(text) {
-        reader.take_statement(line, &statement)?;
+    let mut statements = Statements::new(text);
+    while let Some((line, words)) = statements.next() {
+        if words[0].keyword() == "PRV" {
+            // Data of glasses, whose names can be any word.
+            if !statements.any(|(_, words)| words[0].keyword() == "END") {
+                return Err(Statement { path, line, words: &words }.wrong("END behind the private glasses (PRV)"));
+            }
+            continue;
+        }
+        reader.take_statement(line, &words)?;
     }
     let Reader { blocks, unit_mm, has_radii, .. } = reader;
     if blocks.is_empty() {
@@ -224,13 +239,21 @@ impl Reader<'_> {
         if let Some(number) = begun_surface(&keyword) {
             return self.begin_surface(number, &statement);
         }
+        if !OF_SURFACES.contains(&keyword.as_str()) && !LETTERS.contains(&keyword.as_str()) {
+            return Ok(());
+        }
         // `K S2 -1` and `K -1`.
-        let named = statement.word(1).strip_prefix('S').and_then(|digits| digits.parse::<usize>().ok());
+        let named = match statement.word(1).strip_prefix('S') {
+            Some(name) if name.starts_with(|c: char| c.is_ascii_digit()) => {
+                Some(name.parse::<usize>().map_err(|_| statement.wrong("the number of one surface"))?)
+            }
+            _ => None,
+        };
         let at = if named.is_some() { 2 } else { 1 };
-        let count = self.blocks.len();
-        match named.or(count.checked_sub(1)).filter(|index| *index < count) {
-            Some(index) => self.blocks[index].take_statement(&keyword, at, &statement),
-            None => Ok(()),
+        let index = named.or(self.blocks.len().checked_sub(1));
+        match index.and_then(|index| self.blocks.get_mut(index)) {
+            Some(block) => block.take_statement(&keyword, at, &statement),
+            None => Err(statement.wrong("a statement about a surface that is already there")),
         }
     }
 
@@ -240,13 +263,26 @@ impl Reader<'_> {
         let block = Block { value, ..Block::default() };
         match number {
             // A numbered surface that is not there yet is the next one.
-            Some(number) if number < self.blocks.len() => self.blocks[number].value = value,
-            Some(number) if number > self.blocks.len() + 1 => return Err(statement.wrong("surfaces in order")),
+            Some(number) if number < self.blocks.len() => {
+                self.blocks[number].value = value;
+                self.blocks[number].curvature = None;
+            }
             Some(1) if self.blocks.is_empty() => self.blocks.extend([Block::default(), block]),
+            Some(number) if number > self.blocks.len() => {
+                return Err(statement.wrong(&format!("surface {} before this one", self.blocks.len())));
+            }
+            _ if self.blocks.len() >= MAX_SURFACES => {
+                return Err(statement.wrong(&format!("at most {MAX_SURFACES} surfaces")));
+            }
             _ => self.blocks.push(block),
         }
         Ok(())
     }
+}
+
+/// Returns the curvature of a radius, of which 0 is a plane.
+fn curvature_of(radius: f64) -> f64 {
+    if radius == 0.0 { 0.0 } else { 1.0 / radius }
 }
 
 /// Returns whether a keyword begins a surface, and the number that it names.
@@ -278,10 +314,10 @@ impl Block {
             }
             "SCO" => drop(self.special.insert(statement.word(at), statement.value(at + 1)?)),
             "K" => self.conic = statement.value(at)?,
-            "RDY" => self.radius = Some(statement.value(at)?),
+            "RDY" => self.curvature = Some(curvature_of(statement.value(at)?)),
             "CUY" => self.curvature = Some(statement.value(at)?),
-            "RDX" => self.radius_x = statement.value(at)?,
-            "CUX" => self.curvature_x = Some(statement.value(at)?),
+            "RDX" => self.curvature_x = curvature_of(statement.value(at)?),
+            "CUX" => self.curvature_x = statement.value(at)?,
             "SLB" => self.label = statement.words.get(at).map(|word| word.text.clone()).unwrap_or_default(),
             "CIR" if statement.is_number(at) => self.circle = Some(statement.value(at)?),
             "REX" if statement.is_number(at) => self.rectangle[0] = Some(statement.value(at)?),
@@ -333,14 +369,12 @@ impl Block {
 
     /// Returns the curvature in 1/unit.
     fn curvature(&self, has_radii: Option<bool>) -> Result<f64, String> {
-        let of_radius = |radius: f64| if radius == 0.0 { 0.0 } else { 1.0 / radius };
-        match (self.curvature, self.radius, has_radii) {
-            (Some(curvature), ..) => Ok(curvature),
-            (None, Some(radius), _) => Ok(of_radius(radius)),
-            (None, None, _) if self.value == 0.0 => Ok(0.0),
-            (None, None, Some(true)) => Ok(of_radius(self.value)),
-            (None, None, Some(false)) => Ok(self.value),
-            (None, None, None) => {
+        match (self.curvature, has_radii) {
+            (Some(curvature), _) => Ok(curvature),
+            (None, _) if self.value == 0.0 => Ok(0.0),
+            (None, Some(true)) => Ok(curvature_of(self.value)),
+            (None, Some(false)) => Ok(self.value),
+            (None, None) => {
                 Err("the file does not say whether the number of S is a radius or a curvature; add RDM or RDM NO"
                     .to_owned())
             }
@@ -378,9 +412,8 @@ impl Block {
             "" | "SPH" | "CON" if self.letters.is_empty() => base.conic(),
             "ASP" => base.asphere(&letters),
             "YTO" => {
-                let of_curvature = |c: f64| if c == 0.0 { f64::INFINITY } else { unit / c };
-                let of_radius = if self.radius_x == 0.0 { f64::INFINITY } else { self.radius_x * unit };
-                base.toroid(self.curvature_x.map_or(of_radius, of_curvature), &letters)
+                let radius_x_mm = if self.curvature_x == 0.0 { f64::INFINITY } else { unit / self.curvature_x };
+                base.toroid(radius_x_mm, &letters)
             }
             "XYP" => {
                 let radius = self.special.get("NRADIUS").copied().unwrap_or(1.0);

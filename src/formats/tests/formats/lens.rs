@@ -181,12 +181,72 @@ fn label_of_code_v_in_quotes_is_text() {
     }
 }
 
+fn codev_sag(text: &str) -> Option<f64> {
+    let lens = parse_lens(Path::new("a.seq"), text.as_bytes()).unwrap();
+    lens.choose(Some(&SurfaceChoice::Number(1))).unwrap().surface.as_ref().unwrap().sag(1.0, 2.0)
+}
+
+/// The last statement about a curvature holds, whether it is a radius, a curvature or that of `S`.
+#[test]
+fn last_curvature_of_code_v_holds() {
+    let text = std::fs::read_to_string(folder().join("CV-SPH-mm.seq")).unwrap();
+    let with = |statements: &str| text.replacen("  STO", &format!("  STO; {statements}"), 1);
+    let sag = |radius: &str| codev_sag(&with(&format!("RDY {radius}")));
+    assert_eq!(codev_sag(&with("CUY 0.02; RDY 80")), sag("80"));
+    assert_eq!(codev_sag(&with("RDY 80; CUY 0.02")), sag("50"));
+    assert_eq!(codev_sag(&with("CUY 0.02; RDY 0")), sag("0"));
+    assert_eq!(codev_sag(&with("CUY 0.02; S1 80")), sag("80"));
+    let toroid = std::fs::read_to_string(folder().join("CV-YTO-mm.seq")).unwrap();
+    let with = |statements: &str| codev_sag(&toroid.replacen("  RDX -52", &format!("  {statements}"), 1));
+    assert_eq!(with("CUX 0.02; RDX -52"), codev_sag(&toroid));
+    assert_eq!(with("RDX -52; CUX 0.02"), with("RDX 50"));
+    assert_eq!(with("CUX 0.02; RDX 0"), with("RDX 0"));
+}
+
+/// A surface is named when it is there: neither a gap in the numbers nor a statement ahead of its surface is read.
+#[test]
+fn missing_surfaces_of_code_v_are_refused() {
+    let text = std::fs::read_to_string(folder().join("CV-addressed.seq")).unwrap();
+    let is_refused = |text: &str| match parse_lens(Path::new("a.seq"), text.as_bytes()) {
+        Ok(_) => false,
+        Err(FormatError::Unexpected { .. }) => true,
+        Err(other) => panic!("{other}"),
+    };
+    assert!(!is_refused(&text));
+    for (from, to) in [
+        ("S2 0 0", "S3 0 0"),
+        ("S2 0 0", "S2 0 0\nS4 0 0"),
+        ("K S1", "K S4"),
+        ("A S1", "A S9"),
+        ("ASP S1", "ASP S1..2"),
+        ("S1 0 5", "K -1\nS1 0 5"),
+    ] {
+        assert!(is_refused(&text.replacen(from, to, 1)), "{to}");
+    }
+    // Statements that are not read can name any word.
+    assert!(!is_refused(&text.replacen("STO S1", "STO S9\nTIT S99", 1)));
+}
+
+/// Names of private glasses can be any word.
+#[test]
+fn private_glasses_of_code_v_are_left_out() {
+    let text = std::fs::read_to_string(folder().join("CV-ASP-mm.seq")).unwrap();
+    let glasses = "  STO\n  PRV\n  PWL 656.3 587.6\n    K 1.5 1.6\n    'S' 1.5 1.6\n    S 1.5 1.6\n  ";
+    let with = text.replacen("  STO", &format!("{glasses}END"), 1);
+    assert!(with.contains("PRV"));
+    assert_eq!(codev_sag(&with), codev_sag(&text));
+    let open = parse_lens(Path::new("a.seq"), text.replacen("  STO", glasses, 1).as_bytes());
+    assert!(matches!(open, Err(FormatError::Unexpected { .. })), "{open:?}");
+}
+
 /// Surfaces need more memory than their lines have bytes.
 #[test]
 fn too_many_surfaces_are_refused() {
     let path = Path::new("a.zmx");
     let zemax = format!("UNIT MM\n{}", "SURF 1\n".repeat(10_001));
     assert!(matches!(parse_lens(path, zemax.as_bytes()), Err(FormatError::Unexpected { .. })));
+    let codev = format!("RDM;SO;SI;{}", "S;".repeat(10_001));
+    assert!(matches!(parse_lens(path, codev.as_bytes()), Err(FormatError::Unexpected { .. })));
 }
 
 #[test]
