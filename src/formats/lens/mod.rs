@@ -5,6 +5,7 @@ mod codev;
 mod model;
 mod zemax;
 
+use std::collections::HashSet;
 use std::path::Path;
 
 pub use model::{LensModel, LensSurface, TermsDisc};
@@ -15,6 +16,9 @@ use super::whole;
 /// Largest lens file that is read, in bytes.
 const MAX_BYTES: u64 = 32 << 20;
 
+/// Number of first bytes by which a lens file is detected.
+const HEAD_BYTES: usize = 64 << 10;
+
 /// Format of a lens file, detected by the first lines.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum LensFormat {
@@ -23,21 +27,42 @@ pub(super) enum LensFormat {
 }
 
 /// Returns the format of a lens file from its first bytes; `None` for another file.
+///
+/// The first keyword alone is not enough: other texts begin with words such as `TITLE` and `UNIT` too.
 pub(super) fn lens_format(head: &[u8]) -> Option<LensFormat> {
     let text = decoded(head);
-    let lines =
-        || text.split(['\n', '\r', ';']).map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('!'));
-    let first_word = |line: &str| line.split_whitespace().next().unwrap_or_default().to_uppercase();
-    let has = |keyword: &str| lines().take(200).any(|line| first_word(line) == keyword);
-    let first = lines().next().map(first_word)?;
-    if (first == "VERS" && (has("MODE") || has("SURF")))
-        || (first == "MODE" && has("SURF"))
-        || (first == "UNIT" && has("SURF"))
-    {
+    if is_zemax(&text) {
         return Some(LensFormat::Zemax);
     }
-    let begins = matches!(first.as_str(), "RDM" | "LEN" | "TITLE");
-    (begins && has("SO") | has("S1") | has("S") && has("SI")).then_some(LensFormat::CodeV)
+    is_codev(&text, head.len() >= HEAD_BYTES).then_some(LensFormat::CodeV)
+}
+
+/// Returns true if the first lines are those of Zemax: the first one is of a header, and others are of surfaces.
+fn is_zemax(text: &str) -> bool {
+    let mut keywords = text.split(['\n', '\r']).filter_map(|line| line.split_whitespace().next());
+    let first = keywords.find(|keyword| !keyword.starts_with('!')).unwrap_or_default();
+    if !matches!(first, "VERS" | "MODE" | "UNIT") {
+        return false;
+    }
+    let keywords: HashSet<&str> = keywords.collect();
+    let has_surfaces = keywords.contains("SURF") && ["TYPE", "CURV", "DISZ"].iter().any(|key| keywords.contains(key));
+    has_surfaces || (first == "VERS" && keywords.contains("MODE"))
+}
+
+/// Returns true if the first statements are those of Code V: the first one is of a header, and others begin the object,
+/// and the image if the text is not cut off.
+fn is_codev(text: &str, is_cut: bool) -> bool {
+    let mut keywords = codev::Statements::new(text).map(|(_, words)| words[0].keyword());
+    let first = keywords.next().unwrap_or_default();
+    let is_title = matches!(&first[..], "RDM" | "LEN" | "TIT" | "TITL" | "TITLE");
+    if !is_title && !matches!(&first[..], "EPD" | "FNO" | "DIM" | "WL" | "SO") {
+        return false;
+    }
+    let mut keywords: HashSet<String> = keywords.collect();
+    keywords.insert(first);
+    let has = |keyword: &str| keywords.contains(keyword);
+    let has_object = has("SO") || (is_title && (has("S1") || has("S")));
+    has_object && (is_cut || has("SI"))
 }
 
 /// Reads the surfaces of a lens file of at most 32 MiB.
@@ -54,7 +79,7 @@ pub fn read_lens(path: impl AsRef<Path>) -> Result<LensModel, FormatError> {
 /// # Errors
 /// The same as for [`read_lens`], except that the file is not readable.
 pub fn parse_lens(path: &Path, bytes: &[u8]) -> Result<LensModel, FormatError> {
-    match lens_format(&bytes[..bytes.len().min(1 << 16)]) {
+    match lens_format(&bytes[..bytes.len().min(HEAD_BYTES)]) {
         Some(LensFormat::Zemax) => zemax::parse_zemax(path, &decoded(bytes)),
         Some(LensFormat::CodeV) => codev::parse_codev(path, &decoded(bytes)),
         None => Err(FormatError::Unexpected {
@@ -83,5 +108,39 @@ fn decoded(bytes: &[u8]) -> String {
         _ if bytes.len() >= 16 && zeros(1) > 6 && zeros(0) == 0 => wide(bytes, true),
         _ if bytes.len() >= 16 && zeros(0) > 6 && zeros(1) == 0 => wide(bytes, false),
         _ => std::str::from_utf8(bytes).map_or_else(|_| bytes.iter().map(|&b| b as char).collect(), ToOwned::to_owned),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lens_files_are_detected() {
+        let zemax = Some(LensFormat::Zemax);
+        let codev = Some(LensFormat::CodeV);
+        let long = format!("RDM\nSO 0 1\n{}SI\n", "S 1 2\nASP\nK 0\n".repeat(200));
+        let cut = format!("RDM\nSO 0 1\n{}", "S 1 2\n".repeat(11_000));
+        for (text, expected) in [
+            ("VERS 1\nMODE SEQ\n", zemax),
+            ("! a remark\nUNIT MM\nSURF 0\n  TYPE STANDARD\n", zemax),
+            ("tit 'three; mirrors'\nrdm y\nSO 0 1\ns 1 2\nSI\n", codev),
+            ("! a remark\nFNO 4\nSO 0 1\nS 1 2\nSI\n", codev),
+            ("rdm;len;title 'a';so 0 1;s 1 2;si", codev),
+            ("LEN NEW\nS1 0 5\nSI 0 0\n", codev),
+            (&long, codev),
+            (&cut, codev),
+            // Texts of others.
+            ("TITLE 'a; SO; SI'\n1 2 3\n", None),
+            ("TITLE = \"points\"\nVARIABLES = X, Y, Z\n1 2 3\n", None),
+            ("UNIT MM\nSURF 1 2 3\nSURF 4 5 6\n", None),
+            ("MODE 3D\nx y z\n", None),
+            ("DIM LOC1= LOCATION OF POINT PNT1\nS 1\nSI 2\n", None),
+            ("LEN 5\nS 1\n", None),
+            ("S,SI\n1,2\n", None),
+            ("", None),
+        ] {
+            assert_eq!(lens_format(text.as_bytes()), expected, "{text:.60}");
+        }
     }
 }

@@ -243,7 +243,7 @@ fn private_glasses_of_code_v_are_left_out() {
 #[test]
 fn too_many_surfaces_are_refused() {
     let path = Path::new("a.zmx");
-    let zemax = format!("UNIT MM\n{}", "SURF 1\n".repeat(10_001));
+    let zemax = format!("UNIT MM\n{}", "SURF 1\nCURV 0\n".repeat(10_001));
     assert!(matches!(parse_lens(path, zemax.as_bytes()), Err(FormatError::Unexpected { .. })));
     let codev = format!("RDM;SO;SI;{}", "S;".repeat(10_001));
     assert!(matches!(parse_lens(path, codev.as_bytes()), Err(FormatError::Unexpected { .. })));
