@@ -18,6 +18,15 @@ use super::model::{LensModel, LensSurface, TermsDisc};
 /// Letters of the coefficients of r^4 to r^20. Code V has no I.
 const LETTERS: [&str; 9] = ["A", "B", "C", "D", "E", "F", "G", "H", "J"];
 
+/// Types of `SPS` that are read.
+const SPECIAL: [&str; 4] = ["XYP", "ZFR", "QBF", "QCN"];
+
+/// Index of the last coefficient of a polynomial XYP: y^10.
+const LAST_OF_XYP: u32 = 66;
+
+/// Name under which the number behind the type of `SPS` is kept. No coefficient of a file has it, for it has a blank.
+const SIZE: &str = "number of SPS";
+
 /// Largest number of surfaces that are read, so that they need no more memory than fits the file.
 const MAX_SURFACES: usize = 10_000;
 
@@ -309,7 +318,7 @@ impl Block {
             "SPS" => {
                 self.kind = statement.word(at);
                 if statement.is_number(at + 1) {
-                    self.special.insert("SIZE".to_owned(), statement.value(at + 1)?);
+                    self.special.insert(SIZE.to_owned(), statement.value(at + 1)?);
                 }
             }
             "SCO" => drop(self.special.insert(statement.word(at), statement.value(at + 1)?)),
@@ -363,7 +372,7 @@ impl Block {
 
     /// Returns the disc of the Zernike terms: what Code V makes of them outside is not known.
     fn terms_disc(&self, unit: f64) -> Option<TermsDisc> {
-        let radius_mm = (self.kind == "ZFR").then(|| self.normalisation("C3").ok())?? * unit;
+        let radius_mm = (self.kind == "ZFR").then(|| self.needed_normalisation("C3").ok())?? * unit;
         Some(TermsDisc { centre_mm: [0.0; 2], radius_mm })
     }
 
@@ -397,57 +406,144 @@ impl Block {
         self.special.get(name).copied().unwrap_or(0.0)
     }
 
-    fn normalisation(&self, other: &str) -> Result<f64, String> {
-        let radius = self.special.get("NRADIUS").or_else(|| self.special.get(other)).copied().unwrap_or(0.0);
-        if radius > 0.0 { Ok(radius) } else { Err("it has no normalisation radius (NRADIUS)".to_owned()) }
+    /// Returns the normalisation radius in the unit of the file, of which `alias` is another name; `None` if the file
+    /// states none.
+    fn normalisation(&self, alias: &str) -> Result<Option<f64>, String> {
+        let stated = ["NRADIUS", alias].map(|name| (name, self.special.get(name).copied()));
+        if let Some((name, radius)) = stated.iter().find_map(|(name, radius)| Some((name, (*radius)?)))
+            && radius <= 0.0
+        {
+            return Err(format!("its normalisation radius ({name}) is {radius}; it must be above 0"));
+        }
+        let radius = only(&stated.map(|(name, radius)| (name, radius.unwrap_or(0.0))))?;
+        // The number behind the type repeats the radius in the files that are known.
+        match (self.coefficient(SIZE), radius) {
+            (0.0, radius) => Ok(radius),
+            (size, Some(radius)) if size == radius => Ok(Some(radius)),
+            (size, _) => Err(format!(
+                "the number of its SPS is {size}, which is not its normalisation radius; state the radius as SCO NRADIUS"
+            )),
+        }
+    }
+
+    fn needed_normalisation(&self, alias: &str) -> Result<f64, String> {
+        self.normalisation(alias)?.ok_or_else(|| "it has no normalisation radius (NRADIUS)".to_owned())
+    }
+
+    /// Returns the conic constant, of which `alias` is another name.
+    fn conic(&self, alias: &str) -> Result<f64, String> {
+        let stated = [("K", self.conic), ("SCO K", self.coefficient("K")), (alias, self.coefficient(alias))];
+        Ok(only(&stated)?.unwrap_or(0.0))
+    }
+
+    /// Checks that the surface has no coefficient that its type does not use.
+    fn check_coefficients(&self) -> Result<(), String> {
+        let kind = &self.kind[..];
+        let is_special = SPECIAL.contains(&kind);
+        let unknown =
+            |name: &str| format!("its coefficient {name} is not known for surfaces of the type {kind}; remove it");
+        if let Some((name, _)) = self.special.iter().find(|(name, value)| **value != 0.0 && !is_known(kind, name)) {
+            return Err(unknown(name));
+        }
+        match self.letters.iter().find(|(_, value)| **value != 0.0) {
+            Some((letter, _)) if is_special => Err(unknown(LETTERS[*letter])),
+            _ => Ok(()),
+        }
     }
 
     fn built(&self, curvature: f64, unit: f64) -> Built {
-        let conic = if self.conic != 0.0 { self.conic } else { self.coefficient("K") };
-        let base = Base { curvature_per_mm: curvature / unit, conic };
+        let curvature_per_mm = curvature / unit;
         let letters: Vec<(u32, f64)> =
             (self.letters.iter()).map(|(k, a)| (2 * *k as u32 + 4, a * unit.powi(1 - (2 * *k as i32 + 4)))).collect();
+        let is_conic = letters.iter().all(|(_, a)| *a == 0.0);
+        let base = Base { curvature_per_mm, conic: self.conic };
         match self.kind.as_str() {
-            "" | "SPH" if self.letters.is_empty() && conic == 0.0 => base.conic(),
-            "" | "SPH" | "CON" if self.letters.is_empty() => base.conic(),
-            "ASP" => base.asphere(&letters),
+            kind if SPECIAL.contains(&kind) => {
+                self.check_coefficients()?;
+                self.special(curvature_per_mm, unit)
+            }
+            "" | "SPH" | "CON" if is_conic => self.check_coefficients().and_then(|()| base.conic()),
+            "ASP" => self.check_coefficients().and_then(|()| base.asphere(&letters)),
             "YTO" => {
+                self.check_coefficients()?;
                 let radius_x_mm = if self.curvature_x == 0.0 { f64::INFINITY } else { unit / self.curvature_x };
                 base.toroid(radius_x_mm, &letters)
-            }
-            "XYP" => {
-                let radius = self.special.get("NRADIUS").copied().unwrap_or(1.0);
-                if radius <= 0.0 {
-                    return Err(format!("its normalisation radius is {radius}; it must be above 0"));
-                }
-                let base = Base { conic: conic + self.coefficient("C1"), ..base };
-                let terms = (2..).zip(polynomial_order()).take(300);
-                let terms = terms.map(|(k, (i, j))| (i, j, self.coefficient(&format!("C{k}")) * unit)).collect();
-                base.xy_polynomial(radius * unit, terms)
-            }
-            "ZFR" => {
-                let base = Base { conic: conic + self.coefficient("C1"), ..base };
-                let radius_mm = self.normalisation("C3")? * unit;
-                let values: Vec<f64> = (4..=40).map(|k| self.coefficient(&format!("C{k}")) * unit).collect();
-                sum(base.conic(), zernike(true, radius_mm, &values), [0.0; 2])
-            }
-            kind @ ("QBF" | "QCN") => {
-                let is_qcon = kind == "QCN";
-                let (first, last, conic) = if is_qcon { (4, 16, self.coefficient("C17")) } else { (3, 20, 0.0) };
-                let base = Base { conic: base.conic + conic, ..base };
-                // Listings name the coefficients of Qbfs by the power too: QB4 is C3.
-                let named = |k: i32| self.coefficient(&format!("C{k}")) + self.coefficient(&format!("QB{}", 2 * k - 2));
-                let value = |k: i32| if is_qcon { self.coefficient(&format!("C{k}")) } else { named(k) };
-                let mut values: Vec<f64> = (first..=last).map(|k| value(k) * unit).collect();
-                while values.len() > 1 && values.last() == Some(&0.0) {
-                    values.pop();
-                }
-                base.forbes(is_qcon, self.normalisation("C1")? * unit, values)
             }
             other => Err(format!(
                 "surfaces of the type {other} are not read; sample the sag as points, or write its equation into a definition"
             )),
         }
+    }
+
+    /// Returns a surface of the types of `SPS`.
+    fn special(&self, curvature_per_mm: f64, unit: f64) -> Built {
+        let base = |alias: &str| Ok::<_, String>(Base { curvature_per_mm, conic: self.conic(alias)? });
+        let value = |k: u32| self.coefficient(&format!("C{k}"));
+        match self.kind.as_str() {
+            "XYP" => {
+                let radius = self.normalisation("NRADIUS")?.unwrap_or(1.0);
+                let terms = (2..=LAST_OF_XYP).zip(polynomial_order());
+                let terms = terms.map(|(k, (i, j))| (i, j, value(k) * unit)).collect();
+                base("C1")?.xy_polynomial(radius * unit, terms)
+            }
+            "ZFR" => {
+                let radius_mm = self.needed_normalisation("C3")? * unit;
+                let values: Vec<f64> = (4..=40).map(|k| value(k) * unit).collect();
+                sum(base("C1")?.conic(), zernike(true, radius_mm, &values), [0.0; 2])
+            }
+            kind => {
+                let is_qcon = kind == "QCN";
+                let (first, last, alias) = if is_qcon { (4, 16, "C17") } else { (3, 20, "K") };
+                // Listings name the coefficients of Qbfs by the power too: QB4 is C3.
+                let named = |k: u32| {
+                    let (index, power) = (format!("C{k}"), format!("QB{}", 2 * k - 2));
+                    only(&[(&index, self.coefficient(&index)), (&power, self.coefficient(&power))])
+                };
+                let value = |k: u32| if is_qcon { Ok(value(k)) } else { named(k).map(Option::unwrap_or_default) };
+                let values = (first..=last).map(|k| value(k).map(|value| value * unit));
+                let mut values: Vec<f64> = values.collect::<Result<_, _>>()?;
+                while values.len() > 1 && values.last() == Some(&0.0) {
+                    values.pop();
+                }
+                base(alias)?.forbes(is_qcon, self.needed_normalisation("C1")? * unit, values)
+            }
+        }
+    }
+}
+
+/// Returns the value that is not 0, of names for one coefficient; `None` if all are 0.
+fn only(stated: &[(&str, f64)]) -> Result<Option<f64>, String> {
+    let mut found: Option<(&str, f64)> = None;
+    for &(name, value) in stated.iter().filter(|(_, value)| *value != 0.0) {
+        match found {
+            Some((other, first)) if first != value => {
+                return Err(format!(
+                    "its {other} is {first} and its {name} is {value}, but both are one coefficient; remove one"
+                ));
+            }
+            _ => found = Some((name, value)),
+        }
+    }
+    Ok(found.map(|(_, value)| value))
+}
+
+/// Returns true if a coefficient of `SCO` has a known meaning for a type of surface.
+fn is_known(kind: &str, name: &str) -> bool {
+    let index = |prefix: &str| {
+        let index = name.strip_prefix(prefix)?.parse::<u32>().ok()?;
+        (format!("{prefix}{index}") == name).then_some(index)
+    };
+    let numbered = |known: fn(u32) -> bool| index("C").is_some_and(known);
+    let is_general = matches!(name, "K" | "NRADIUS" | SIZE);
+    match kind {
+        "XYP" => is_general || numbered(|k| (1..=LAST_OF_XYP).contains(&k)),
+        "ZFR" => is_general || numbered(|k| matches!(k, 1 | 3..=40)),
+        "QBF" => {
+            let is_power = index("QB").is_some_and(|power| power % 2 == 0 && (4..=38).contains(&power));
+            is_general || is_power || numbered(|k| matches!(k, 1 | 3..=20))
+        }
+        "QCN" => is_general || numbered(|k| matches!(k, 1 | 4..=17)),
+        _ => false,
     }
 }
 

@@ -227,6 +227,46 @@ fn missing_surfaces_of_code_v_are_refused() {
     assert!(!is_refused(&text.replacen("STO S1", "STO S9\nTIT S99", 1)));
 }
 
+/// A coefficient with two names is taken once; one without a meaning for its type is refused.
+#[test]
+fn coefficients_of_code_v_are_taken_once() {
+    let base = |name: &str| std::fs::read_to_string(folder().join(name)).unwrap();
+    let read = |name: &str, statements: &str| -> Option<f64> {
+        let text = base(name).replacen("\nS     0.0", &format!("\n  {statements}\nS     0.0"), 1);
+        assert!(text.contains(statements));
+        let lens = parse_lens(Path::new("a.seq"), text.as_bytes()).unwrap();
+        match lens.choose(Some(&SurfaceChoice::Number(1))) {
+            Ok(surface) => surface.surface.as_ref().unwrap().sag(1.0, 2.0),
+            Err(ChoiceError::Unreadable { number: 1, .. }) => None,
+            Err(other) => panic!("{other}"),
+        }
+    };
+    // Each file has K or C1 of -0.7, and the normalisation radii 15 (XYP), 18 (ZFR) and 16 (QBF, QCN).
+    for (name, same, refused) in [
+        (
+            "CV-XYP-nrad-mm.seq",
+            "SCO C1 -0.7",
+            &["SCO C1 -0.5", "K -0.5", "SCO C67 20", "SCO C01 1", "A 1e-9", "SPS XYP 14"][..],
+        ),
+        ("CV-XYP-mm.seq", "K -0.7; SCO C66 0", &["SPS XYP 15", "SCO NRADIUS 0", "SCO NRADIUS -1", "SCO QB4 1"]),
+        ("CV-ZFR-mm.seq", "SCO K -0.7; SCO C3 18; SPS ZFR 18", &["K -0.6", "SCO C3 17", "SCO C2 1", "SCO C41 1"]),
+        (
+            "CV-QBF-mm.seq",
+            "SCO C1 16; SCO C3 5.00000000000000028e-02",
+            &["SCO C3 0.01", "SCO C1 17", "SCO QB5 1", "SCO C2 1"],
+        ),
+        ("CV-QCN-mm.seq", "SCO C17 -0.7; SCO C1 16", &["SCO C17 -0.5", "SCO C18 1", "SCO C3 1", "SPS QCN 15"]),
+        ("CV-ASP-mm.seq", "SCO C4 0", &["SCO C4 1"]),
+        ("CV-SPH-mm.seq", "A 0", &["SCO K 1", "A 1e-9"]),
+    ] {
+        let plain = read(name, "! nothing");
+        assert!(plain.is_some() && read(name, same) == plain, "{name}");
+        for statements in refused {
+            assert_eq!(read(name, statements), None, "{name}: {statements}");
+        }
+    }
+}
+
 /// Names of private glasses can be any word.
 #[test]
 fn private_glasses_of_code_v_are_left_out() {
