@@ -1,18 +1,20 @@
 //! `regrind compensate`: corrects an existing program by a map of the part's error.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use regrind::compensation::Correction;
 use regrind::compensation::path::{TargetSurface, correction_spline, nominal_height_field};
+use regrind::config::read_named_dialect;
 use regrind::formats::gcode::{
-    AlongNormals, Amended, Amendment, GcodeError, MapKind, correct_program, read_program_map,
+    AlongNormals, Amended, Amendment, GcodeError, LINUXCNC, MapKind, correct_program, read_program_map,
 };
 use regrind::formats::is_same_file;
 use regrind::geometry::Grid;
 use regrind::surface::PlaneProjection;
 use serde::Serialize;
 
+use super::check::or_show;
 use super::failure::Failure;
 use super::nominal::{self, NominalTable};
 use super::words::three_digits;
@@ -23,9 +25,12 @@ use super::{Outcome, finite_above_zero};
 #[command(after_long_help = LONG_HELP, after_help = "Example:\n  regrind compensate --program part.ngc --map error_map.csv --out part-2.ngc\n\n--help \
 shows more than -h.")]
 pub(super) struct Arguments {
-    /// Program to correct, in the dialect of LinuxCNC
+    /// Program to correct
     #[arg(long, value_name = "FILE")]
     program: PathBuf,
+    /// Dialect of the program: linuxcnc, fanuc, sinumerik, heidenhain, or the file of another dialect
+    #[arg(long, value_name = "NAME", default_value = LINUXCNC)]
+    dialect: String,
     /// error_map.csv, whose error is subtracted, or correction.csv, which is added to a program without a correction
     #[arg(long, value_name = "FILE")]
     map: PathBuf,
@@ -57,6 +62,7 @@ pub(super) struct Arguments {
 const LONG_HELP: &str = "\
 Example:
   regrind compensate --program part.ngc --map error_map.csv --out part-2.ngc
+  regrind compensate --program O7001.nc --dialect fanuc --map error_map.csv --out O7002.nc
 
 x and y of the map are in the work coordinates of the program (G54): the model frame. Without --nominal, the command
 applies the map along z. On a slope, where the unit normal has the z component nz, a correction e is then too small by
@@ -118,7 +124,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         level_off_mm,
     );
     let ground = arguments.nominal.as_ref().map(|file| ground(file, &arguments.table)).transpose()?;
+    let dialect = or_show(read_named_dialect(&arguments.dialect, Path::new("")))?.dialect;
     let amendment = Amendment {
+        dialect: Some(&dialect),
         shift: &shift,
         along_normals: ground.as_ref().map(|nominal| AlongNormals { nominal, centre_above_mm: tip_mm }),
         tolerance_mm: 1e-3 * arguments.tolerance_um,

@@ -22,7 +22,7 @@ pub use cell_config::{
     CellConfig, CmmConfig, GrinderConfig, GrinderLimits, LinkConfig, ProgramConfig, ReferenceSphere, RotaryConfig,
     TravelLimits,
 };
-pub use dialect::{DialectFile, dialect_schema, dialects, parse_dialect, read_dialect};
+pub use dialect::{DialectFile, dialect_schema, dialects, parse_dialect, read_dialect, read_named_dialect};
 #[cfg(feature = "plant")]
 pub use plant::{PlantConfig, plant_schema};
 pub use tables::RotaryLetter;

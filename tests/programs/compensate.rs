@@ -8,6 +8,7 @@ use crate::program::run;
 use regrind::compensation::{Correction, ErrorMap};
 use regrind::formats::{CorrectionIdentities, ErrorMapOrigin, write_correction, write_error_map};
 use regrind::geometry::Grid;
+use regrind_sim::motion::Waypoint;
 use regrind_sim::program::Control;
 
 const GRID: Grid = Grid { columns: 121, rows: 81, first_mm: [-30.0, -20.0], spacing_mm: [0.5, 0.5] };
@@ -512,4 +513,151 @@ fn generated_arcs_remain_arcs() {
         turns += 1;
     }
     assert!(turns > 100, "{turns}");
+}
+
+/// Dialects with the name of their files, and the largest rounding of a coordinate in mm.
+const DIALECTS: [(&str, f64); 4] = [("linuxcnc", 5e-7), ("fanuc", 5e-5), ("sinumerik", 5e-7), ("heidenhain", 5e-5)];
+
+fn dialect(name: &str) -> regrind::formats::gcode::Dialect {
+    regrind::config::read_named_dialect(name, std::path::Path::new("")).unwrap().dialect
+}
+
+/// A program of `plan` in each dialect comes back corrected by the map: each of its points is where the map moves it, by
+/// readers that share no code with the correction. With four decimals within 0.1 µm, with six within 0.01 µm.
+#[test]
+fn planned_programs_come_back_in_their_dialect() {
+    for (name, rounding_mm) in DIALECTS {
+        for arcs_within_mm in [None, Some(1e-4)] {
+            let mut part = part("biconic");
+            part.programs.options = with(&part.programs.options, part.programs.options.wheel, 6.0);
+            part.programs.dialect = dialect(name);
+            part.programs.controller_tolerance_mm = Some(part.programs.path_tolerance_mm);
+            (part.programs.arcs_within_mm, part.programs.part_identity) = (arcs_within_mm, PART);
+            let bench = Shop::new(error_mm, "M2\n");
+            part.programs.write(&bench.path("base"), &Correction::zero(GRID, 0.02), [9; 32]).unwrap();
+            bench.save_error(error_mm, None);
+            let text = bench.correct("base", "out", &["--dialect", name, "--tolerance-um", "0.01"]).unwrap();
+            let control = Control::named(name).unwrap();
+            let base = control.read(&fs::read_to_string(bench.path("base")).unwrap()).unwrap();
+            let corrected = control.read(&text).unwrap_or_else(|why| panic!("{name}: {why}"));
+            assert_eq!(corrected.tolerance_mm, base.tolerance_mm, "{name}");
+            // Every point of the base is moved by the map, and is an end of a corrected move.
+            let mut ends = corrected.waypoints.iter();
+            let (mut worst, mut points) = (0.0f64, 0);
+            let is_over_map = |[x, y, _]: [f64; 3]| x.abs() < 29.0 && y.abs() < 19.0;
+            let on_map = |stop: &&Waypoint| stop.feed_mm_min.is_some() && is_over_map(stop.at_mm);
+            for stop in base.waypoints.iter().filter(on_map) {
+                let [x, y, z] = stop.at_mm;
+                let wanted = [x, y, z - error_mm(x, y)];
+                let off = |at: [f64; 3]| (0..3).map(|k| (at[k] - wanted[k]).powi(2)).sum::<f64>().sqrt();
+                let limit_mm = rounding_mm * 3f64.sqrt() + 1e-6;
+                let found = ends.find(|end| end.feed_mm_min == stop.feed_mm_min && off(end.at_mm) <= limit_mm);
+                let found = found.unwrap_or_else(|| panic!("{name}: no move ends at {wanted:?}"));
+                worst = worst.max(off(found.at_mm));
+                points += 1;
+            }
+            assert!(points > 100 && worst <= if rounding_mm > 1e-6 { 1e-4 } else { 1e-5 }, "{name}: {points}, {worst}");
+            let again = bench.correct("out", "again", &["--dialect", name]).unwrap_err();
+            assert!(again.contains("already"), "{name}: {again}");
+        }
+    }
+}
+
+/// Arcs of a program stay arcs in each dialect while the map is constant.
+#[test]
+fn arcs_stay_arcs_in_their_dialect() {
+    for (name, rounding_mm) in DIALECTS {
+        let mut part = part("biconic");
+        part.programs.options = with(&part.programs.options, part.programs.options.wheel, 6.0);
+        part.programs.dialect = dialect(name);
+        part.programs.controller_tolerance_mm = Some(part.programs.path_tolerance_mm);
+        (part.programs.arcs_within_mm, part.programs.part_identity) = (Some(1e-4), PART);
+        let bench = Shop::new(|_, _| 0.0, "M2\n");
+        part.programs.write(&bench.path("base"), &Correction::zero(GRID, 0.02), [9; 32]).unwrap();
+        bench.save_error(|_, _| 0.004, None);
+        let text = bench.correct("base", "out", &["--dialect", name]).unwrap();
+        let control = Control::named(name).unwrap();
+        let base = control.read(&fs::read_to_string(bench.path("base")).unwrap()).unwrap();
+        let corrected = control.read(&text).unwrap();
+        assert_eq!(base.waypoints.len(), corrected.waypoints.len(), "{name}");
+        let mut turns = 0;
+        for (pair, same) in base.waypoints.windows(2).zip(corrected.waypoints.windows(2)) {
+            if pair[1].feed_mm_min.is_none() || pair[1].arc.is_none() {
+                continue;
+            }
+            let [was, is] = [pair, same].map(|pair| pair[1].position_at(pair[0].at_mm, 0.3));
+            let off = [is[0] - was[0], is[1] - was[1], is[2] - was[2] + 0.004];
+            assert!(off.iter().all(|v| v.abs() < 2.0 * rounding_mm + 2e-6), "{name}: {off:?}");
+            turns += 1;
+        }
+        assert!(turns > 50, "{name}: {turns}");
+    }
+}
+
+/// Programs as shops have them: each move is at the place that the control takes from its words.
+#[test]
+fn programs_of_shops_are_corrected_in_their_dialect() {
+    let constant = |name: &str, program: &str| {
+        let bench = Shop::new(|_, _| 0.004, program);
+        bench.compensate(&["--dialect", name])
+    };
+    let lines = |text: &str| -> Vec<String> {
+        let is_code = |line: &&str| !line.contains("REGRIND") && !line.contains("SHA256") && !line.contains("GAIN");
+        text.lines().filter(is_code).map(str::to_owned).collect()
+    };
+    // Fanuc: a program number, increments of 0.1 µm without a point, modal words.
+    let fanuc = "%\r\nO1234(MIRROR)\r\nN10 G21 G90 G54\r\nN20 G00 X0 Y0 Z50000\r\nG01 Z10000 F500.\r\nX100000 Y-2.5\r\nG02 X12.5 Y0. I0 J25000\r\nG00 Z5.\r\nM30\r\n%\r\n";
+    let text = constant("fanuc", fanuc).unwrap();
+    assert!(text.starts_with("%\r\nO1234(MIRROR)\r\n(REGRIND "), "{text}");
+    let told = lines(&text);
+    for line in [
+        "G00 X0.0000 Y0.0000 Z5.0000",
+        "F500.",
+        "G01 X0.0000 Y0.0000 Z0.9960",
+        "G01 X10.0000 Y-2.5000 Z0.9960",
+        "G02 X12.5000 Y0.0000 Z0.9960 I0.0000 J2.5000",
+        "M30",
+    ] {
+        assert!(told.iter().any(|found| found == line), "{line}: {told:#?}");
+    }
+    assert!(told.ends_with(&["%".to_owned()]));
+    // Klartext: a centre before the arc, feeds within moves, a tool that is called.
+    let heidenhain = "0 BEGIN PGM MIRROR MM\n1 BLK FORM 0.1 Z X-20 Y-20 Z-10\n2 TOOL CALL 1 Z S3000\n3 L Z+50 R0 FMAX M3\n4 L X+0 Y+0 R0 FMAX\n5 L Z+1 R0 F500\n6 L X+10 Y-2.5\n7 CC X+10 Y+0\n8 C X+12.5 Y+0 DR+ F300\n9 L Z+50 R0 FMAX M30\n10 END PGM MIRROR MM\n";
+    let text = constant("heidenhain", heidenhain).unwrap();
+    let told = lines(&text);
+    let numbers: Vec<usize> = text.lines().map(|line| line.split(' ').next().unwrap().parse().unwrap()).collect();
+    assert_eq!(numbers, (0..numbers.len()).collect::<Vec<_>>(), "{text}");
+    for line in [
+        "BLK FORM 0.1 Z X-20 Y-20 Z-10",
+        "TOOL CALL 1 Z S3000",
+        "L Z+50.0000 R0 FMAX",
+        "L X+10.0000 Y-2.5000 Z+0.9960",
+        "CC X+10.0000 Y+0.0000",
+        "C X+12.5000 Y+0.0000 DR+ F300",
+        "END PGM MIRROR MM",
+    ] {
+        assert!(told.iter().any(|found| found.split_once(' ').unwrap().1 == line), "{line}: {told:#?}");
+    }
+    // Sinumerik: an assignment to an axis, and the radius of an arc.
+    let sinumerik = "N10 G710 G90 G17\nN20 G0 X0 Y0 Z50 ; above\nN30 G1 Z=1 F500\nN40 G2 X10 Y0 CR=5\nN50 M30\n";
+    let told = lines(&constant("sinumerik", sinumerik).unwrap());
+    for line in ["G1 X0.000000 Y0.000000 Z0.996000", "G2 X10.000000 Y0.000000 Z0.996000 I5.000000 J0.000000", "M30"] {
+        assert!(told.iter().any(|found| found.split_once(' ').is_some_and(|(_, rest)| rest == line)), "{told:#?}");
+    }
+    // What is not known is refused with its line.
+    for (name, program, line) in [
+        ("fanuc", fanuc.replace("G02", "G65 P100"), 7),
+        ("fanuc", fanuc.replace("G54", "G54 G43.4 H1"), 3),
+        ("heidenhain", heidenhain.replace("L X+10 Y-2.5", "L IX+10 Y-2.5"), 7),
+        ("heidenhain", heidenhain.replace("R0 F500", "RL F500"), 6),
+        ("heidenhain", heidenhain.replace("6 L X+10 Y-2.5", "6 CALL LBL 1"), 7),
+        ("heidenhain", heidenhain.replace("7 CC X+10 Y+0\n", ""), 8),
+        ("sinumerik", sinumerik.replace("G1 Z=1", "G1 Z=IC(1)"), 3),
+        ("sinumerik", sinumerik.replace("CR=5", "CR=R1"), 4),
+    ] {
+        let refused = constant(name, &program).unwrap_err();
+        assert!(refused.contains(&format!("line {line}")) || refused.contains(&format!(":{line}")), "{refused}");
+    }
+    assert!(constant("linuxcnc", fanuc).unwrap_err().contains("--dialect"));
+    assert!(constant("tng", fanuc).is_err());
 }

@@ -261,8 +261,15 @@ pub fn program(bytes: &[u8]) -> bool {
     };
     let mut is_read = false;
     for along_normals in [None, Some(AlongNormals { nominal: &nominal, centre_above_mm: 5.0 })] {
-        let amendment =
-            Amendment { shift: &shift, along_normals, tolerance_mm: 1e-3, map: &map, gain: 1.0, max_shift_mm: 0.5 };
+        let amendment = Amendment {
+            shift: &shift,
+            along_normals,
+            tolerance_mm: 1e-3,
+            map: &map,
+            gain: 1.0,
+            dialect: None,
+            max_shift_mm: 0.5,
+        };
         let amended = correct_program(&base, &out, &amendment);
         // The two interpreters agree on whatever is not refused.
         assert!(!amended.as_ref().is_err_and(|error| error.to_string().contains("report it with")), "{amended:?}");

@@ -21,6 +21,9 @@ use super::amendment::{Amendment, displacement};
 use super::arc::Arc;
 use super::check::Check;
 use super::control::{AXES, Act, Control, all};
+use super::dialect::Dialect;
+use super::dialect_reading::{DialectReader, NeutralLine, foreign, has_absolute_centres};
+use super::dialect_writing::DialectWriter;
 use super::map::{MapBase, identity_in};
 use super::number::{push_fixed, rounded};
 use super::read::{Block, GcodeWord, Refusal, block};
@@ -88,40 +91,21 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     let text = decoded(&bytes)
         .ok_or_else(|| program("the program is not plain text", "give the text file that the controller reads"))?;
     let text = &*text;
-    if let Some((what, remedy)) = other_control(text) {
+    let dialect = foreign(amendment.dialect);
+    if let Some((what, remedy)) = other_control(text).filter(|_| dialect.is_none()) {
         return Err(program(what, remedy));
     }
     if is_same_file(base, out) {
         return Err(program("the corrected program would overwrite this one", "give another name to --out"));
     }
     refuse_foreign(base, text, amendment)?;
-    let mut writer = Rewriter::new(amendment);
-    writer.done.unit_assumed = !states_unit_first(text);
+    let mut correction = ProgramCorrection::new(amendment, dialect, text, &Sha256::digest(&bytes).into());
     let mut draft = Draft::create(out)?;
-    let header = header(&Sha256::digest(&bytes).into(), amendment, writer.done.unit_assumed);
-    let mut check = Check::new(amendment, &header);
-    let mut begun = false;
     for (number, line) in (1..).zip(text.lines()) {
         let refused = |(what, remedy): Refusal| GcodeError::Line { path: base.to_owned(), line: number, what, remedy };
-        if writer.control.ended {
-            // No control reads beyond the end of the program.
-            draft.write(format!("{line}\n").as_bytes())?;
-            continue;
-        }
-        let block = block(line).map_err(refused)?;
-        let is_blank = block.words.is_empty() && block.comments.is_empty() && !block.percent;
-        // The header follows the percent sign, if there is one.
-        if !begun && !block.percent && !is_blank {
-            draft.write(header.as_bytes())?;
-            begun = true;
-        }
-        writer.text.clear();
-        writer.line(line, &block).map_err(refused)?;
-        check.line(line, &writer.text).map_err(refused)?;
-        draft.write(&writer.text)?;
-        writer.control.ended |= begun && block.percent;
+        draft.write(&correction.line(line).map_err(refused)?)?;
     }
-    let done = writer.done;
+    let done = correction.rewriter.done;
     if done.straight + done.arcs == 0 {
         return Err(program(
             "the program has no move at feed, so there is nothing to correct",
@@ -139,6 +123,107 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     Ok(done)
 }
 
+/// Correction of a program, line by line.
+struct ProgramCorrection<'a> {
+    rewriter: Rewriter<'a>,
+    check: Check<'a>,
+    /// Form of the program, if it is not that of LinuxCNC.
+    adapter: Option<DialectAdapter<'a>>,
+    header: String,
+    /// True if the header is written.
+    begun: bool,
+}
+
+/// Readers and writer of a dialect.
+struct DialectAdapter<'a> {
+    base: DialectReader<'a>,
+    /// Reader of the lines that are written, for the check.
+    corrected: DialectReader<'a>,
+    writer: DialectWriter<'a>,
+}
+
+impl<'a> ProgramCorrection<'a> {
+    fn new(amendment: &'a Amendment<'a>, dialect: Option<&'a Dialect>, text: &str, base: &[u8; 32]) -> Self {
+        let mut rewriter = Rewriter::new(amendment);
+        rewriter.done.unit_assumed = !states_unit_first(text, dialect);
+        let header = header(base, amendment, rewriter.done.unit_assumed);
+        let check = Check::new(amendment, &header);
+        let adapter = dialect.map(|dialect| DialectAdapter {
+            base: DialectReader::new(dialect),
+            corrected: DialectReader::new(dialect),
+            writer: DialectWriter::new(dialect),
+        });
+        Self { rewriter, check, adapter, header, begun: false }
+    }
+
+    /// Returns the corrected lines for one line of the base program.
+    fn line(&mut self, line: &str) -> Result<Vec<u8>, Refusal> {
+        if self.rewriter.control.ended {
+            // No control reads beyond the end of the program.
+            return Ok(match &mut self.adapter {
+                None => format!("{line}\n").into_bytes(),
+                Some(adapter) => adapter.after_end(line),
+            });
+        }
+        let neutral = match &mut self.adapter {
+            None => NeutralLine::new(line),
+            Some(adapter) => adapter.base.neutral(line)?,
+        };
+        let block = block(&neutral.words)?;
+        let is_blank = line.trim().is_empty();
+        let mut out = Vec::new();
+        // The header follows the percent sign and the name of the program, if there is one.
+        if !self.begun && !block.percent && !neutral.is_frame && !is_blank {
+            out = match &mut self.adapter {
+                None => self.header.clone().into_bytes(),
+                Some(adapter) => adapter.writer.header(&self.header)?,
+            };
+            self.begun = true;
+        }
+        self.rewriter.text.clear();
+        match (&neutral.copied, &mut self.adapter) {
+            (Some(copied), Some(adapter)) => {
+                self.rewriter.stay(&block)?;
+                let written = adapter.writer.copied(copied, &neutral.words);
+                self.check.line(&neutral.words, &adapter.neutral(&written)?)?;
+                out.extend(written);
+            }
+            (_, adapter) => {
+                self.rewriter.line(&neutral.words, &block)?;
+                let written = match adapter {
+                    None => std::mem::take(&mut self.rewriter.text),
+                    Some(adapter) => adapter.writer.express(&self.rewriter.text)?,
+                };
+                let read = match adapter {
+                    None => written.clone(),
+                    Some(adapter) => adapter.neutral(&written)?,
+                };
+                self.check.line(&neutral.words, &read)?;
+                out.extend(written);
+            }
+        }
+        self.rewriter.control.ended |= self.begun && block.percent;
+        Ok(out)
+    }
+}
+
+impl DialectAdapter<'_> {
+    /// Reads lines that were written, in the words of LinuxCNC.
+    fn neutral(&mut self, written: &[u8]) -> Result<Vec<u8>, Refusal> {
+        let mut text = Vec::new();
+        for line in String::from_utf8_lossy(written).lines() {
+            text.extend_from_slice(self.corrected.neutral(line)?.words.as_bytes());
+            text.push(b'\n');
+        }
+        Ok(text)
+    }
+
+    fn after_end(&mut self, line: &str) -> Vec<u8> {
+        let line = self.base.without_number(line);
+        if line.is_empty() { Vec::new() } else { self.writer.copied(line, "") }
+    }
+}
+
 /// Decodes a program as UTF-8, or else as Latin-1, which older programs use for remarks. Returns `None` if it has
 /// control characters and is therefore not text.
 fn decoded(bytes: &[u8]) -> Option<std::borrow::Cow<'_, str>> {
@@ -152,7 +237,7 @@ fn decoded(bytes: &[u8]) -> Option<std::borrow::Cow<'_, str>> {
 /// Detects, from the first 20 lines, a program for a Fanuc, Heidenhain or Sinumerik control, which cannot be corrected.
 /// Returns the fault and the remedy; `None` for any other program.
 fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
-    const AGAIN: &str = "regrind compensate supports only the dialect of LinuxCNC; for another control, write the program with regrind plan --program in its dialect";
+    const AGAIN: &str = "name its dialect with --dialect, such as fanuc, sinumerik or heidenhain";
     /// Number of lines that are checked; later lines do not identify the control.
     const LOOKED_AT: usize = 20;
     let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty() && *line != "%").take(LOOKED_AT);
@@ -178,9 +263,12 @@ fn other_control(text: &str) -> Option<(&'static str, &'static str)> {
 /// feed. Returns false if such a line comes before any unit.
 ///
 /// Also returns true if the program has no such line, or if a line that cannot be read comes first.
-fn states_unit_first(text: &str) -> bool {
+fn states_unit_first(text: &str, dialect: Option<&Dialect>) -> bool {
+    let mut reader = dialect.map(DialectReader::new);
     for line in text.lines() {
-        let Ok(block) = block(line) else { return true };
+        let neutral = reader.as_mut().map_or_else(|| Ok(NeutralLine::new(line)), |reader| reader.neutral(line));
+        let Ok(line) = neutral.map(|line| line.words) else { return true };
+        let Ok(block) = block(&line) else { return true };
         if block.words.iter().any(|word| word.letter == b'G' && [20.0, 21.0].contains(&word.value)) {
             return true;
         }
@@ -202,8 +290,9 @@ fn states_unit_first(text: &str) -> bool {
 fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), GcodeError> {
     let refused = |what: &str, remedy| Err(GcodeError::Program { path: path.to_owned(), what: what.into(), remedy });
     let mut maps = Vec::new();
-    let comments = text.lines().filter(|line| line.contains("sha256") || line.contains(UNCORRECTED));
-    for line in comments {
+    let lines = text.lines().map(str::to_ascii_lowercase);
+    for line in lines.filter(|line| line.contains("sha256") || line.contains(UNCORRECTED)) {
+        let line = line.as_str();
         if line.contains(UNCORRECTED) {
             // The program was written without correction: the map named last before this line is not in it.
             maps.pop();
@@ -270,7 +359,8 @@ struct Rewriter<'a> {
 
 impl<'a> Rewriter<'a> {
     fn new(amendment: &'a Amendment<'a>) -> Self {
-        let (control, done) = (Control::new(), Amended::default());
+        let (mut control, done) = (Control::new(), Amended::default());
+        control.arcs_absolute = foreign(amendment.dialect).is_some_and(has_absolute_centres);
         Self { amendment, control, text: Vec::new(), done, actual: [None; 3], beside: String::new() }
     }
 
@@ -312,6 +402,20 @@ impl<'a> Rewriter<'a> {
             }
         }
         self.copy_after(block);
+        Ok(())
+    }
+
+    /// Executes a line that is copied.
+    ///
+    /// # Errors
+    /// A line that moves the tool.
+    fn stay(&mut self, block: &Block) -> Result<(), Refusal> {
+        self.done.lines += 1;
+        match self.control.execute_block(block)? {
+            Act::Stay => {}
+            _ => return Err(("the line moves the tool in a way that is not known".into(), "write out what it does")),
+        }
+        (0..3).filter(|&k| self.control.at[k].is_none()).for_each(|k| self.actual[k] = None);
         Ok(())
     }
 
@@ -376,7 +480,7 @@ impl<'a> Rewriter<'a> {
         let corrected: Vec<Point> =
             shifts.iter().enumerate().map(|(k, shift)| way(k as f64 / count as f64) + shift).collect();
         self.measure(way, length, &shifts)?;
-        let arc = arc.filter(|_| {
+        let arc = arc.filter(|arc| self.can_write_arc(arc.rise)).filter(|_| {
             // Controls reject an arc with two radii.
             let alike = (0.5 * tolerance).min(MAX_WOUND_MM);
             shifts.iter().all(|shift| (shift - shifts[0]).norm() <= alike)
@@ -471,6 +575,13 @@ impl<'a> Rewriter<'a> {
         self.done.feed_mm += length;
         self.done.outside_map_mm += if share == 1.0 { length } else { share * length };
         Ok(())
+    }
+
+    /// Tells whether the dialect has words for an arc that rises by `rise_mm`.
+    fn can_write_arc(&self, rise_mm: f64) -> bool {
+        foreign(self.amendment.dialect).is_none_or(|dialect| {
+            dialect.arcs.as_ref().is_some_and(|arcs| arcs.third_axis || rise_mm.abs() <= ROUNDING_MM)
+        })
     }
 
     fn point(&mut self, at: &Point) {

@@ -3,6 +3,7 @@
 use regrind_core::compensation::path::{HeightField, TargetSurface, ball_displacement};
 use regrind_core::geometry::{Point, Vector};
 
+use super::dialect::Dialect;
 use super::map::ProgramMap;
 use super::read::Refusal;
 
@@ -20,6 +21,8 @@ pub struct Amendment<'a> {
     pub map: &'a ProgramMap,
     /// Factor by which the map was multiplied.
     pub gain: f64,
+    /// Form of the program; `None` for that of LinuxCNC.
+    pub dialect: Option<&'a Dialect>,
     /// Maximum displacement of a point, in millimetres; a larger one is rejected.
     pub max_shift_mm: f64,
 }

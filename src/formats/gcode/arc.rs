@@ -20,7 +20,8 @@ pub(super) struct Arc {
     begins: f64,
     /// Angle of the sweep, in radians; positive is counter-clockwise.
     pub(super) sweep: f64,
-    rise: f64,
+    /// Way along the axis perpendicular to the plane.
+    pub(super) rise: f64,
 }
 
 /// Centre of an arc, as the program gives it.

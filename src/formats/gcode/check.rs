@@ -9,20 +9,25 @@ use std::collections::BTreeMap;
 use regrind_core::geometry::{Point, Vector};
 
 use super::amendment::{Amendment, displacement};
+use super::dialect_reading::{foreign, has_absolute_centres, has_g_words};
 use super::number::PER_MM;
 use super::read::{Block, Refusal, block};
 
-/// Tolerance for the rounding of three coordinates and of an arc's centre to the last written digit, in millimetres.
-const DIGITS_MM: f64 = 4.0 / PER_MM;
+/// Number of steps of the last written digit by which three coordinates and an arc's centre can be rounded.
+const ROUNDED_STEPS: f64 = 4.0;
 
 /// Maximum difference between the radii at the ends of an arc, in millimetres; controls reject a larger one.
-const MAX_WOUND_MM: f64 = 0.0127 + DIGITS_MM;
+const MAX_WOUND_MM: f64 = 0.0127 + 0.004;
 
 /// Base program and corrected program, read side by side.
 pub(super) struct Check<'a> {
     amendment: &'a Amendment<'a>,
     base: Machine,
     corrected: Machine,
+    /// Tolerance for the rounding to the last written digit, in millimetres.
+    digits_mm: f64,
+    /// False for Klartext, in which each arc has its plane.
+    has_planes: bool,
 }
 
 /// Modal state and position of a machine.
@@ -222,7 +227,13 @@ impl<'a> Check<'a> {
     /// correction writes at the beginning of the corrected program. Their modal words, such as G90, are applied to the
     /// corrected program only.
     pub(super) fn new(amendment: &'a Amendment<'a>, header: &str) -> Self {
-        let mut check = Self { amendment, base: Machine::default(), corrected: Machine::default() };
+        let dialect = foreign(amendment.dialect);
+        let centres_absolute = dialect.is_some_and(has_absolute_centres);
+        let machine = || Machine { centres_absolute, ..Machine::default() };
+        let per_mm = dialect.map_or(PER_MM, |dialect| 10f64.powi(i32::from(dialect.numbers.decimals)));
+        let (base, corrected) = (machine(), machine());
+        let has_planes = dialect.is_none_or(has_g_words);
+        let mut check = Self { amendment, base, corrected, digits_mm: ROUNDED_STEPS / per_mm, has_planes };
         for line in header.lines() {
             // The header contains no moves.
             let _ = block(line).map(|block| check.corrected.read(&block));
@@ -256,7 +267,9 @@ impl<'a> Check<'a> {
             }
         }
         count_words(&base, &mut words, -1);
-        if let (false, Some((word, _))) = (over, words.iter().find(|(_, count)| **count != 0)) {
+        let is_plane = |word: &str| matches!(word, "G17" | "G18" | "G19") && !self.has_planes;
+        let lost = words.iter().find(|(word, count)| **count != 0 && !is_plane(word));
+        if let (false, Some((word, _))) = (over, lost) {
             return Err(format!("{word} is lost or added"));
         }
         self.same_state()?;
@@ -264,7 +277,7 @@ impl<'a> Check<'a> {
             (None, []) => Ok(()),
             (Some(Movement::Rapid(to)), [Movement::Rapid(found)]) => {
                 let same = |k: usize| match (to[k], found[k]) {
-                    (Some(a), Some(b)) => (a - b).abs() <= DIGITS_MM,
+                    (Some(a), Some(b)) => (a - b).abs() <= self.digits_mm,
                     (a, b) => a == b,
                 };
                 if (0..3).all(same) { Ok(()) } else { Err(format!("a rapid move to {found:?}, not to {to:?}")) }
@@ -291,7 +304,8 @@ impl<'a> Check<'a> {
     /// A message, if one of these conditions is not met.
     fn same_state(&self) -> Result<(), String> {
         let (base, corrected) = (&self.base, &self.corrected);
-        let same = base.inches == corrected.inches && base.plane == corrected.plane && base.feed == corrected.feed;
+        let same_plane = base.plane == corrected.plane || !self.has_planes;
+        let same = base.inches == corrected.inches && same_plane && base.feed == corrected.feed;
         let known = (0..3).all(|k| base.at[k].is_some() == corrected.at[k].is_some());
         let rest = base.centres_absolute == corrected.centres_absolute && base.over == corrected.over;
         if same && known && rest && !corrected.by_distance {
@@ -308,7 +322,7 @@ impl<'a> Check<'a> {
     /// # Errors
     /// A description of the first difference; a point of the move with no nominal surface under it.
     fn along(&self, way: &Movement, found: &[Movement]) -> Result<(), String> {
-        let allowed = self.amendment.tolerance_mm + DIGITS_MM;
+        let allowed = self.amendment.tolerance_mm + self.digits_mm;
         let at = |share: f64| {
             let base = way.at(share);
             displacement(self.amendment, &base).map(|by| base + by).map_err(|(found, _)| found)

@@ -804,7 +804,7 @@ impl ArcWords {
 /// Placeholders in the lines of a dialect.
 pub(super) const NAME: &str = "{name}";
 pub(super) const NUMBER: &str = "{number}";
-const TOLERANCE: &str = "{tolerance_mm}";
+pub(super) const TOLERANCE: &str = "{tolerance_mm}";
 /// Words that are rejected in the lines of a dialect: for inches, for incremental positions, and for feeds by time or
 /// by revolution.
 const OTHER: [&str; 9] = ["G20", "G70", "G700", "G91", "G93", "G95", "G96", "G961", "INCH"];

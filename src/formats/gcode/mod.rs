@@ -1,9 +1,9 @@
-//! Programs for numerically controlled machines: written in the dialect of a control, and read and corrected in the
-//! dialect of LinuxCNC.
+//! Programs for numerically controlled machines: written, read and corrected in the dialect of a control.
 //!
 //! ```text
 //!  ToolPath + Dialect --write_program--> part.ngc, part.nc, part.mpf, part.h
-//!  base.ngc --Program::read--> lines and moves --correct--> corrected.ngc     (with a map over x and y)
+//!  base program --dialect_reading--> words of LinuxCNC --amend--> corrected words --dialect_writing--> program
+//!                                                      (with a map over x and y)
 //! ```
 
 mod amend;
@@ -12,6 +12,8 @@ mod arc;
 mod check;
 mod control;
 mod dialect;
+mod dialect_reading;
+mod dialect_writing;
 mod error;
 mod map;
 mod number;

@@ -493,7 +493,7 @@ fn push_feed(text: &mut Vec<u8>, feed: i64, dialect: &Dialect) {
 /// Appends the number of a block to `text` if the dialect numbers blocks. `numbered` is the number of earlier blocks
 /// with a number. After the last number of the dialect, the numbers begin again with the first one.
 #[inline]
-fn number(text: &mut Vec<u8>, dialect: &Dialect, numbered: u64) {
+pub(super) fn number(text: &mut Vec<u8>, dialect: &Dialect, numbered: u64) {
     let Some(blocks) = &dialect.blocks else { return };
     // After the last number the first one follows again.
     let round = u64::from(blocks.last.saturating_sub(blocks.first) / blocks.step.max(1)) + 1;
@@ -502,7 +502,7 @@ fn number(text: &mut Vec<u8>, dialect: &Dialect, numbered: u64) {
 }
 
 #[inline]
-fn end_line(text: &mut Vec<u8>, dialect: &Dialect) {
+pub(super) fn end_line(text: &mut Vec<u8>, dialect: &Dialect) {
     text.extend_from_slice(match dialect.text.line_end {
         LineEnd::Lf => b"\n",
         LineEnd::Crlf => b"\r\n",
@@ -564,7 +564,7 @@ impl<'a> Frame<'a> {
             let all = self.dialect.blocks.as_ref().is_some_and(|blocks| blocks.all);
             self.begin.iter().for_each(|line| self.line(&mut text, line, all, &mut numbered));
             for words in header_words(header, summary, arcs, count) {
-                for line in self.comments(&words) {
+                for line in comments(self.dialect, &words) {
                     self.line(&mut text, &line, all, &mut numbered);
                 }
             }
@@ -586,28 +586,28 @@ impl<'a> Frame<'a> {
         self.end.iter().for_each(|line| self.line(&mut text, line, true, &mut numbered));
         String::from_utf8_lossy(&text).into_owned()
     }
+}
 
-    /// Formats `words` as comments of the dialect: as many lines as the longest line of the dialect requires.
-    fn comments(&self, words: &str) -> Vec<String> {
-        let text = &self.dialect.text;
-        // A block number before the comment takes space too.
-        let marks = text.comment_begins.len() + text.comment_ends.len() + 12;
-        let room = text.max_line_length.saturating_sub(marks).max(20);
-        let words = comment(words);
-        let words = if text.upper_case { words.to_ascii_uppercase() } else { words };
-        let mut lines = vec![String::new()];
-        for word in words.split(' ') {
-            let last = lines.len() - 1;
-            let line = &mut lines[last];
-            if line.is_empty() || line.len() + 1 + word.len() <= room {
-                line.push_str(if line.is_empty() { "" } else { " " });
-                line.push_str(word);
-            } else {
-                lines.push(word.to_owned());
-            }
+/// Formats `words` as comments of the dialect: as many lines as the longest line of the dialect requires.
+pub(super) fn comments(dialect: &Dialect, words: &str) -> Vec<String> {
+    let text = &dialect.text;
+    // A block number before the comment takes space too.
+    let marks = text.comment_begins.len() + text.comment_ends.len() + 12;
+    let room = text.max_line_length.saturating_sub(marks).max(20);
+    let words = comment(words);
+    let words = if text.upper_case { words.to_ascii_uppercase() } else { words };
+    let mut lines = vec![String::new()];
+    for word in words.split(' ') {
+        let last = lines.len() - 1;
+        let line = &mut lines[last];
+        if line.is_empty() || line.len() + 1 + word.len() <= room {
+            line.push_str(if line.is_empty() { "" } else { " " });
+            line.push_str(word);
+        } else {
+            lines.push(word.to_owned());
         }
-        lines.iter().map(|line| format!("{}{line}{}", text.comment_begins, text.comment_ends)).collect()
     }
+    lines.iter().map(|line| format!("{}{line}{}", text.comment_begins, text.comment_ends)).collect()
 }
 
 /// Returns the texts of the comments at the beginning of a program, one text per comment. `h` is the content of the
