@@ -40,7 +40,7 @@ const OF_SURFACES: [&str; 27] = [
 #[derive(Clone, Default)]
 struct Block {
     label: String,
-    /// Word of the type: SPH, CON, ASP, YTO and so on; `XYP` and its like of a special surface.
+    /// StatementWord of the type: SPH, CON, ASP, YTO and so on; `XYP` and its like of a special surface.
     kind: String,
     /// Number of the `S` statement: a radius or a curvature.
     value: f64,
@@ -82,14 +82,14 @@ pub(super) fn parse_codev(path: &Path, text: &str) -> Result<LensModel, FormatEr
     Ok(LensModel { surfaces })
 }
 
-/// Word of a statement. A text in quotes is one word, and neither a keyword nor a number.
+/// StatementWord of a statement. A text in quotes is one word, and neither a keyword nor a number.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Word {
+pub(super) struct StatementWord {
     text: String,
     is_quoted: bool,
 }
 
-impl Word {
+impl StatementWord {
     /// Returns the word in upper case; empty for a text in quotes.
     pub(super) fn keyword(&self) -> String {
         if self.is_quoted { String::new() } else { self.text.to_uppercase() }
@@ -109,7 +109,7 @@ impl<'a> Statements<'a> {
 
     /// Reads a text up to its closing `mark`; a doubled mark is one of the text. It ends with its line, whatever quotes
     /// say.
-    fn quoted(&mut self, mark: char) -> Word {
+    fn quoted(&mut self, mark: char) -> StatementWord {
         let mut text = String::new();
         while let Some(c) = self.rest.next_if(|c| !is_line_end(*c)) {
             if c == mark && self.rest.next_if_eq(&mark).is_none() {
@@ -117,7 +117,7 @@ impl<'a> Statements<'a> {
             }
             text.push(c);
         }
-        Word { text, is_quoted: true }
+        StatementWord { text, is_quoted: true }
     }
 
     /// Returns true if nothing, or a comment, stands in the rest of the line.
@@ -136,13 +136,13 @@ fn is_line_end(c: char) -> bool {
 }
 
 impl Iterator for Statements<'_> {
-    type Item = (usize, Vec<Word>);
+    type Item = (usize, Vec<StatementWord>);
 
     fn next(&mut self) -> Option<Self::Item> {
         let (mut words, mut word, mut begin) = (Vec::new(), String::new(), self.line);
-        let close = |word: &mut String, words: &mut Vec<Word>| {
+        let close = |word: &mut String, words: &mut Vec<StatementWord>| {
             if !word.is_empty() {
-                words.push(Word { text: std::mem::take(word), is_quoted: false });
+                words.push(StatementWord { text: std::mem::take(word), is_quoted: false });
             }
         };
         while let Some(c) = self.rest.next() {
@@ -190,7 +190,7 @@ struct Reader<'a> {
 struct Statement<'a> {
     path: &'a Path,
     line: usize,
-    words: &'a [Word],
+    words: &'a [StatementWord],
 }
 
 impl Statement<'_> {
@@ -205,7 +205,7 @@ impl Statement<'_> {
 
     /// Returns a word in upper case; empty if there is none, or a text in quotes.
     fn word(&self, at: usize) -> String {
-        self.words.get(at).map(Word::keyword).unwrap_or_default()
+        self.words.get(at).map(StatementWord::keyword).unwrap_or_default()
     }
 
     fn value(&self, at: usize) -> Result<f64, FormatError> {
@@ -222,7 +222,7 @@ impl Statement<'_> {
 }
 
 impl Reader<'_> {
-    fn take_statement(&mut self, line: usize, words: &[Word]) -> Result<(), FormatError> {
+    fn take_statement(&mut self, line: usize, words: &[StatementWord]) -> Result<(), FormatError> {
         let statement = Statement { path: self.path, line, words };
         let keyword = statement.word(0);
         match keyword.as_str() {
@@ -553,7 +553,7 @@ mod tests {
 
     fn statements(text: &str) -> Vec<(usize, Vec<String>)> {
         // Marks texts in quotes.
-        let shown = |word: &Word| if word.is_quoted { format!("<{}>", word.text) } else { word.text.clone() };
+        let shown = |word: &StatementWord| if word.is_quoted { format!("<{}>", word.text) } else { word.text.clone() };
         Statements::new(text).map(|(line, words)| (line, words.iter().map(shown).collect())).collect()
     }
 
