@@ -53,7 +53,8 @@ Example:
 
 The maps must overlap. --place gives the 16 numbers of a 4 x 4 matrix for each map, as the stage or the frame of the
 station says. The poses are then estimated from the overlaps; the form of the part is in both maps of an overlap, so it
-does not change them. --initial, --lock and the other options of the fit are those of the whole.
+does not change them. An error that all maps have, such as that of the reference of an interferometer, is in no overlap:
+calibrate it before. --initial, --lock and the other options of the fit are those of the whole.
 
 Writes into the folder:
   stitching.json              the pose of each map, their covariance, and the seams: mean step, 95 % interval of the
@@ -113,10 +114,9 @@ fn places(arguments: &Arguments) -> Result<Vec<Pose>, Failure> {
 fn failure(arguments: &Arguments, error: StitchingError) -> Failure {
     let file = |map: usize| arguments.measured[map].clone();
     match error {
-        StitchingError::Whole(source) => Failure::of_registration(source, &arguments.nominal, &file(0)),
-        StitchingError::TooFewPoints { map, .. } | StitchingError::NoOverlap { map, .. } => {
-            Failure::Stitching { path: file(map), source: error }
-        }
+        StitchingError::TooFewPoints { map, .. }
+        | StitchingError::NoOverlap { map, .. }
+        | StitchingError::OffPart { map, .. } => Failure::Stitching { path: file(map), source: error },
         error => Failure::Stitching { path: arguments.nominal.clone(), source: error },
     }
 }
@@ -139,14 +139,11 @@ fn summary(arguments: &Arguments, stitching: &Stitching) -> String {
         format!("{}, {points}, {}", count(stitching.common_from_map.len()), counted(stitching.rounds, "round")),
     );
     line("deviation", format!("RMS {} µm, PV {} µm", um(quality.rms_mm), um(quality.pv_mm)));
-    line("noise", format!("{} nm for one point", nm(stitching.noise_sigma_mm)));
-    if stitching.correlation_factor > 1.0 {
-        let factor = three_digits(stitching.correlation_factor);
-        line("", format!("neighbouring points share noise: variances of means are {factor} times larger"));
-    }
+    let noises: Vec<String> = stitching.noise_sigmas_mm.iter().map(|sigma_mm| nm(*sigma_mm)).collect();
+    line("noise", format!("{} nm for one point of the maps", noises.join(", ")));
     line("seams", "maps, places; mean step; true step in the middle (95 %); RMS of the differences".to_owned());
-    for Seam { maps: [first, second], places, step_mm, sigma_mm, rms_mm, .. } in stitching.seams.iter().take(MAX_SEAMS)
-    {
+    for seam in stitching.seams.iter().take(MAX_SEAMS) {
+        let Seam { maps: [first, second], places, step_mm, sigma_mm, rms_mm, .. } = seam;
         let (step, half, rms) = (nm(*step_mm), nm(1.96 * sigma_mm), nm(*rms_mm));
         let maps = format!("{} and {}, {}", first + 1, second + 1, count(*places));
         line("", format!("{maps:<18} {step:>9} nm   0 ± {half} nm   {rms} nm"));

@@ -29,10 +29,6 @@ pub struct StitchingDocument<'a> {
     /// Covariance of small twists of the maps relative to the whole, six rows and columns for each map: translation,
     /// rotation, in the model frame about its origin.
     covariance: Vec<Vec<f64>>,
-    /// Standard deviation of the noise of one point, from the overlaps.
-    noise_sigma_mm: f64,
-    /// Factor of the covariance because the noise of neighbouring points is correlated.
-    correlation_factor: f64,
     seams: Vec<SeamDocument>,
     rounds: usize,
 }
@@ -43,6 +39,10 @@ struct StitchedMap<'a> {
     points: usize,
     common_from_map: [[f64; 4]; 4],
     standard_uncertainty: StandardUncertainty,
+    /// Standard deviation of the noise of one point, from the overlaps.
+    noise_sigma_mm: f64,
+    /// Factor of the variance of means over areas, because the noise of neighbouring points is correlated.
+    correlation_factor: f64,
 }
 
 #[derive(Serialize)]
@@ -50,6 +50,7 @@ struct SeamDocument {
     /// Numbers of the two maps, from 1.
     maps: [usize; 2],
     places: usize,
+    left_out: usize,
     /// Middle of the overlap in the model frame.
     middle_mm: [f64; 3],
     /// Mean of the deviation of the first map minus that of the second.
@@ -59,6 +60,8 @@ struct SeamDocument {
     /// Largest standard uncertainty of the true step anywhere in the overlap.
     max_sigma_mm: f64,
     rms_mm: f64,
+    /// Variance of means over blocks of the overlap, as a multiple of that of independent noise.
+    correlation_factor: f64,
 }
 
 /// Half width of a 95 % interval in standard uncertainties.
@@ -70,11 +73,13 @@ impl From<&Seam> for SeamDocument {
         Self {
             maps: seam.maps.map(|map| map + 1),
             places: seam.places,
+            left_out: seam.left_out,
             middle_mm: seam.middle.into(),
             step_mm: seam.step_mm,
             true_step_mm: [-half_mm, half_mm],
             max_sigma_mm: seam.max_sigma_mm,
             rms_mm: seam.rms_mm,
+            correlation_factor: seam.correlation_factor,
         }
     }
 }
@@ -119,14 +124,14 @@ fn document<'a>(stitching: &Stitching, files: &'a [(PathBuf, usize)]) -> Stitchi
             points: *points,
             common_from_map: stitching.common_from_map[k].to_rows(),
             standard_uncertainty: StandardUncertainty { x_mm, y_mm, z_mm, rx_rad, ry_rad, rz_rad },
+            noise_sigma_mm: stitching.noise_sigmas_mm[k],
+            correlation_factor: stitching.correlation_factors[k],
         }
     };
     StitchingDocument {
         program: ProgramVersion::this(),
         maps: files.iter().enumerate().map(map).collect(),
         covariance: covariance.row_iter().map(|row| row.iter().copied().collect()).collect(),
-        noise_sigma_mm: stitching.noise_sigma_mm,
-        correlation_factor: stitching.correlation_factor,
         seams: stitching.seams.iter().map(SeamDocument::from).collect(),
         rounds: stitching.rounds,
     }

@@ -24,7 +24,12 @@ pub enum StitchingError {
     )]
     NoOverlap { map: usize, places: usize, min_places: usize },
     #[error(
-        "the poses of the maps still change after {rounds} rounds; check the start poses, and that all maps are of one \
+        "map {}: only {on_part} of {points} points lie on the part and are no outliers; check its start pose, and that it \
+         is of this part", map + 1
+    )]
+    OffPart { map: usize, on_part: usize, points: usize },
+    #[error(
+        "the poses of the maps still change after {rounds} steps; check the start poses, and that all maps are of one \
          part"
     )]
     NotConverged { rounds: usize },

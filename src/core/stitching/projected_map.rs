@@ -17,14 +17,20 @@ pub(super) struct ProjectedMap {
     /// Normals there, towards the probe.
     pub(super) normals: Vec<Vector>,
     pub(super) deviations_mm: Vec<f64>,
-    /// False for a point whose projection is beyond the edge of the nominal surface.
-    pub(super) on_part: Vec<bool>,
+    /// False for an outlier, and for a point whose projection is beyond the edge of the nominal surface.
+    pub(super) is_usable: Vec<bool>,
 }
 
 impl ProjectedMap {
     /// Projects points onto the offset surface under the pose `model_from_map`. `facets` has the facet of each point at
-    /// which the search begins, and receives the facet that is found.
-    pub(super) fn new(surface: &OffsetSurface, points: &[Point], pose: &Pose, facets: &mut [FacetIndex]) -> Self {
+    /// which the search begins, and receives the facet that is found. `is_outlier` marks points that are not used.
+    pub(super) fn new(
+        surface: &OffsetSurface,
+        points: &[Point],
+        is_outlier: &[bool],
+        pose: &Pose,
+        facets: &mut [FacetIndex],
+    ) -> Self {
         let found: Vec<_> = points
             .par_iter()
             .zip(facets.par_iter_mut())
@@ -35,16 +41,24 @@ impl ProjectedMap {
                 (point, found)
             })
             .collect();
+        let on_part = found.iter().map(|(_, found)| found.beyond_edge_steps <= EDGE_TOLERANCE_STEPS);
         Self {
             points: found.iter().map(|(point, _)| *point).collect(),
             feet: found.iter().map(|(point, found)| point - found.normal * found.distance_mm).collect(),
             normals: found.iter().map(|(_, found)| found.normal).collect(),
             deviations_mm: found.iter().map(|(_, found)| found.distance_mm).collect(),
-            on_part: found.iter().map(|(_, found)| found.beyond_edge_steps <= EDGE_TOLERANCE_STEPS).collect(),
+            is_usable: on_part.zip(is_outlier).map(|(on_part, is_outlier)| on_part && !is_outlier).collect(),
         }
     }
 
     pub(super) fn len(&self) -> usize {
         self.points.len()
+    }
+
+    /// Tells whether a point belongs to a sample of about `most` points that are spread over the map.
+    pub(super) fn is_sampled(&self, i: usize, most: usize) -> bool {
+        /// Multiples of the golden section are spread evenly, whatever the length of the rows of a map.
+        const GOLDEN: f64 = 0.618_033_988_749_894_9;
+        (i as f64 * GOLDEN).fract() * self.len() as f64 <= most as f64
     }
 }

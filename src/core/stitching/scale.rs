@@ -1,6 +1,6 @@
 //! Coordinates of small motions.
 
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::{Matrix3, Matrix3x6, Matrix6, Vector6};
 
 use crate::geometry::{Point, Pose, Twist, Vector};
 
@@ -44,6 +44,23 @@ impl Scale {
         Vector6::new(shift.x, shift.y, shift.z, x, y, z)
     }
 
+    /// Returns the matrix that gives the shift of a point by a motion.
+    pub(super) fn shift_from_motion(&self, point: &Point) -> Matrix3x6<f64> {
+        let arm = (point - self.centre) / self.size_mm;
+        let mut shift = Matrix3x6::zeros();
+        shift.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
+        shift.fixed_view_mut::<3, 3>(0, 3).copy_from(&-arm.cross_matrix());
+        shift
+    }
+
+    /// Returns the variance of the shift of a point along the surface, from the covariance of the motion: the mean of the
+    /// two directions.
+    pub(super) fn lateral_variance(&self, covariance: &Matrix6<f64>, point: &Point, normal: &Vector) -> f64 {
+        let shift = self.shift_from_motion(point);
+        let spread = shift * covariance * shift.transpose();
+        (0.5 * (spread.trace() - (normal.transpose() * spread * normal)[0])).max(0.0)
+    }
+
     /// Returns the matrix that transforms a motion to a small twist about the origin: translation in millimetres,
     /// rotation in radians.
     pub(super) fn twist_from_motion(&self) -> Matrix6<f64> {
@@ -74,6 +91,16 @@ mod tests {
         assert!(
             (Pose::exp(&twist).transform_point(&point) - scale.pose(&small).transform_point(&point)).norm() < 1e-11
         );
+    }
+
+    #[test]
+    fn lateral_variance_of_known_motions() {
+        let scale = Scale { centre: Point::origin(), size_mm: 10.0 };
+        let (point, normal) = (Point::new(20.0, 0.0, 0.0), Vector::z());
+        let one = |k: usize| Matrix6::from_diagonal(&Vector6::ith(k, 1.0));
+        // Shifts along x and y, none along z; a rotation about z shifts by twice the motion at twice the size.
+        let variances = [0, 1, 2, 3, 4, 5].map(|k| scale.lateral_variance(&one(k), &point, &normal));
+        assert_eq!(variances, [0.5, 0.5, 0.0, 0.0, 0.0, 2.0]);
     }
 
     #[test]
