@@ -130,6 +130,9 @@ pub enum FormatError {
     /// The file is a valid file of another format.
     #[error("{path}: expected {expected}, found {found}; {remedy}")]
     WrongKind { path: PathBuf, expected: &'static str, found: &'static str, remedy: &'static str },
+    /// The file is of a version of its format that is not read.
+    #[error("{path}: expected {expected}, found {found}; {remedy}")]
+    Version { path: PathBuf, expected: &'static str, found: String, remedy: &'static str },
     /// A container that is damaged, encrypted or compressed by an unsupported method.
     #[error("{path}: the zip container cannot be read: {source}; copy or export the file again")]
     Container { path: PathBuf, source: zip::result::ZipError },

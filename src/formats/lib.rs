@@ -22,6 +22,7 @@ mod learned;
 mod lens;
 mod map;
 mod maps;
+mod measured_document;
 mod measured_map;
 pub mod metropro;
 mod nominal_file;
@@ -95,6 +96,7 @@ use cad::cad_format;
 use height_map::MapFormat;
 use layout::is_separator_line;
 use lens::lens_format;
+use measured_document::{DocumentFormat, document_format, parse_document};
 use measured_map::map_format;
 use regrind_core::geometry::Point;
 use scanner_cloud::{CloudFormat, cloud_format, parse_cloud};
@@ -108,14 +110,16 @@ enum Kind {
     Cad,
     Lens,
     Cloud(CloudFormat),
+    Document(DocumentFormat),
     Map(&'static MapFormat),
 }
 
 /// Reads measured points, in millimetres and in the order of the file. The file is text, PLY (its vertices are the
-/// points), or a map of heights (its measured samples are the points).
+/// points), QIF (its measured points), or a map of heights (its measured samples are the points).
 ///
 /// The points of a map lie on the surface. The points of another file can lie on the surface or can be the centres of a
-/// spherical probe; the file does not show which.
+/// spherical probe. Text and PLY do not show which; QIF can state it, and a note of [`read_measured_with_notes`] then
+/// repeats it.
 ///
 /// # Errors
 /// A file that cannot be read, or that is not valid in its format; an STL or TOML file; a format that this program does
@@ -124,7 +128,7 @@ pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> 
     read_measured_with_notes(path, &Table::default()).map(|read| read.points)
 }
 
-/// Reads measured points from a text file, a PLY file or a map, as [`read_measured`] does. Returns the points in
+/// Reads measured points from a text file, a PLY file, a QIF document or a map, as [`read_measured`] does. Returns the points in
 /// millimetres, with notes on the content of the file that is ambiguous. If the file is a table, `table` gives the
 /// columns and units that the file does not state.
 ///
@@ -134,7 +138,7 @@ pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> 
 pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
     let wrong = |found, remedy| {
-        let expected = "measured points as text or PLY, or a map of heights of a known format";
+        let expected = "measured points as text, PLY or QIF, or a map of heights of a known format";
         Err(FormatError::WrongKind { path: path.to_owned(), expected, found, remedy })
     };
     let kind = kind(path)?;
@@ -150,6 +154,7 @@ pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result
             let bytes = whole::open(path)?.read_all(path, whole::MAX_BYTES)?;
             parse_cloud(path, &bytes, format, table.unit)
         }
+        Kind::Document(format) => parse_document(path, &whole::open(path)?.read_all(path, result::MAX_BYTES)?, format),
         Kind::Map(format) => format.read_points(path).map(|map| {
             let note = |note| PointNote::Map { path: path.to_owned(), note };
             NotedPoints { points: map.points, notes: map.notes.into_iter().map(note).collect() }
@@ -201,6 +206,9 @@ fn kind(path: &Path) -> Result<Kind, FormatError> {
     }
     if let Some(format) = cloud_format(head) {
         return Ok(Kind::Cloud(format));
+    }
+    if let Some(format) = document_format(head) {
+        return Ok(Kind::Document(format));
     }
     if cad_format(head).is_some() {
         return Ok(Kind::Cad);

@@ -177,6 +177,14 @@ pub fn read_nominal_as(path: impl AsRef<Path>, table: &Table) -> Result<NominalF
                 remedy: "give them as the measurement",
             });
         }
+        Kind::Document(_) => {
+            return Err(FormatError::WrongKind {
+                path: path.to_owned(),
+                expected: "a nominal surface as points, mesh or definition",
+                found: "the results of a measuring machine",
+                remedy: "give them as the measurement",
+            });
+        }
         Kind::Map(_) => {
             return Err(FormatError::WrongKind {
                 path: path.to_owned(),

@@ -6,6 +6,8 @@ use std::path::PathBuf;
 
 use regrind_core::geometry::Point;
 
+use super::result_content::Coordinates;
+
 /// Points, with notes on how they were read.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct NotedPoints {
@@ -49,6 +51,15 @@ pub enum PointNote {
         /// Value that was read.
         value_mm: f64,
     },
+    /// The file says whether its points are centres of the probe or points of the surface.
+    Coordinates {
+        /// The file.
+        path: PathBuf,
+        /// Meaning of the points.
+        coordinates: Coordinates,
+        /// Radius of the probe, if the file states it.
+        probe_radius_mm: Option<f64>,
+    },
     /// A map has content that can be read in more than one way, or a cloud of points has coarse coordinates.
     Map {
         /// The file.
@@ -77,6 +88,17 @@ impl fmt::Display for PointNote {
                          that the file is complete"
                     ),
                 }
+            }
+            Self::Coordinates { path, coordinates, probe_radius_mm } => {
+                let points = match coordinates {
+                    Coordinates::Centres => "centres of the probe",
+                    Coordinates::Contacts => "points of the surface",
+                };
+                write!(f, "{}: the file says that its points are {points}", path.display())?;
+                if let Some(radius_mm) = probe_radius_mm {
+                    write!(f, " with the probe radius {radius_mm} mm")?;
+                }
+                write!(f, "; check that the method and the probe radius of the registration agree")
             }
             Self::Map { path, note } => write!(f, "{}: {note}", path.display()),
             Self::OneThousandsMark { path, line, found, value_mm } => write!(

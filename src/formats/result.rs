@@ -31,7 +31,7 @@ use super::{FormatError, dmis, ply, qif, whole};
 pub use crate::result_content::{Content, Coordinates, DecimalMark, ResultFile, Statements};
 
 /// Largest result file that is read, in bytes.
-const MAX_BYTES: u64 = 512 << 20;
+pub(super) const MAX_BYTES: u64 = 512 << 20;
 /// Bytes at the beginning of a file in which statements are searched.
 const PREAMBLE_BYTES: usize = 64 << 10;
 

@@ -6,6 +6,7 @@ mod iges_text;
 mod instrument_maps;
 mod lens;
 mod map_files;
+mod measured_documents;
 mod points;
 mod real_files;
 mod step_text;
