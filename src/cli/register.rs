@@ -29,7 +29,7 @@ pub(super) struct Arguments {
     /// Nominal surface: points as text or PLY, a mesh as STL or PLY, a CAD model as STEP or IGES, or a TOML definition
     #[arg(long, value_name = "FILE")]
     nominal: PathBuf,
-    /// Measured points as text or PLY, in mm, or as QIF, or an interferometer's or profilometer's map (X3P, SDF, MetroPro, datx, sur, opd, opdx, al3d and others)
+    /// Measured points as text or PLY, in mm, or as QIF or DMIS output, or an interferometer's or profilometer's map (X3P, SDF, MetroPro, datx, sur, opd, opdx, al3d and others)
     #[arg(long, value_name = "FILE")]
     measured: PathBuf,
     #[command(flatten)]

@@ -27,6 +27,23 @@ pub(super) fn is_dmis(head: &[u8]) -> bool {
     BEGINNINGS.iter().any(|word| head.get(..word.len()).is_some_and(|begins| begins.eq_ignore_ascii_case(word)))
 }
 
+/// Words that begin a line of DMIS, and not of a table with a line of DMIS above it, such as `UNITS/INCH`.
+const STATEMENTS: [&[u8]; 5] = [b"DMISMN/", b"DMISMD/", b"FILNAM/", b"OUTPUT/", b"ENDFIL"];
+
+/// Returns true if `head`, the beginning of a file, is that of a DMIS file. A table with a line of DMIS above it is none.
+pub(super) fn is_dmis_file(head: &[u8]) -> bool {
+    let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head);
+    let begins =
+        |line: &[u8], word: &[u8]| line.get(..word.len()).is_some_and(|begin| begin.eq_ignore_ascii_case(word));
+    let is_feature = |line: &[u8]| {
+        let kind = line.iter().position(|b| *b == b'=').map(|at| line[at + 1..].trim_ascii_start());
+        (begins(line, b"FA(") || begins(line, b"F(")) && kind.is_some_and(|kind| begins(kind, b"FEAT/"))
+    };
+    let is_statement = |line: &[u8]| is_feature(line) || STATEMENTS.iter().any(|word| begins(line, word));
+    let mut lines = head.split(|b| *b == b'\n').map(<[u8]>::trim_ascii).filter(|line| !line.is_empty());
+    lines.next().is_some_and(|first| is_statement(first) || is_dmis(first) && lines.any(is_statement))
+}
+
 /// Statement, joined into one line, and the number of the line where it began.
 struct Statement {
     text: String,
@@ -39,6 +56,8 @@ struct Reading {
     unit_mm: Option<f64>,
     points: Vec<Point>,
     names: Vec<String>,
+    /// True if there is a nominal feature, `F(...) = FEAT`.
+    has_nominal: bool,
     statements: Statements,
     is_ended: bool,
 }
@@ -60,10 +79,18 @@ pub(super) fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, Fo
 /// setting in `content` is used.
 ///
 /// # Errors
-/// A file without `ENDFIL`, without a point, or without `UNITS` before its first point; a point that is not cartesian
-/// or has text in place of a number; a statement with an impossible value.
+/// A file without `ENDFIL`, without a point or with nominal features alone, or without `UNITS` before its first point; a
+/// point that is not cartesian or has text in place of a number; a statement with an impossible value.
 pub(super) fn parse(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, FormatError> {
-    let Reading { points, names, statements, .. } = read(path, text)?;
+    let Reading { points, names, statements, has_nominal, .. } = read(path, text)?;
+    if points.is_empty() && has_nominal {
+        return Err(FormatError::WrongKind {
+            path: path.to_owned(),
+            expected: "DMIS output with actual points, FA(...) = FEAT/POINT",
+            found: "DMIS with nominal features alone, F(...) = FEAT, such as a program",
+            remedy: "give the output that the program writes",
+        });
+    }
     if points.is_empty() {
         return Err(FormatError::NoData { path: path.to_owned(), expected: "actual points, FA(...) = FEAT/POINT" });
     }
@@ -142,6 +169,10 @@ impl Reading {
                 Ok(())
             }
             _ if keyword.starts_with("FA(") && keyword.contains('=') => self.actual(path, statement, before, after),
+            _ if keyword.starts_with("F(") && keyword.contains('=') => {
+                self.has_nominal = true;
+                Ok(())
+            }
             _ => Ok(()),
         }
     }
@@ -269,6 +300,34 @@ mod tests {
         );
         // A feature name that is not a target's leaves only the order to identify the target.
         assert_eq!(parsed(&file().replace("FA(P9)", "FA(TOP)")).unwrap().indices, None);
+    }
+
+    #[test]
+    fn dmis_reads_actual_points_alone() {
+        let nominal = "F(P7)=FEAT/POINT,CART,91,92,93,0,0,1\nFA(P7) =";
+        let found = parsed(&file().replace("FA(P7) =", nominal)).unwrap();
+        assert_eq!(found.points, parsed(&file()).unwrap().points);
+        let alone = "UNITS/MM\nF(P7)=FEAT/POINT,CART,91,92,93,0,0,1\nOUTPUT/FA(P7)\nENDFIL\n";
+        assert!(matches!(parsed(alone), Err(FormatError::WrongKind { .. })));
+        assert!(matches!(parsed("UNITS/MM\nENDFIL\n"), Err(FormatError::NoData { .. })));
+    }
+
+    #[test]
+    fn dmis_files_are_told_from_tables() {
+        for head in [
+            "DMISMN/'p', 05.2\n",
+            "\u{feff}\r\nfilnam/'SN-7'\r\n",
+            "UNITS/MM\nFA(P7) = FEAT/POINT,CART,1,2,3\n",
+            "$$ made by a program\nunits/mm\nENDFIL\n",
+            "F(P7)=FEAT/POINT,CART,1,2,3\n",
+        ] {
+            assert!(is_dmis_file(head.as_bytes()), "{head}");
+        }
+        for head in
+            ["UNITS/INCH\nx,y,z\n1,2,3\n", "$$ points\n1,2,3\n", "F(x) = 3 z\n1,2,3\n", "DIM LOC1= LOCATION\n", ""]
+        {
+            assert!(!is_dmis_file(head.as_bytes()), "{head}");
+        }
     }
 
     #[test]

@@ -115,10 +115,10 @@ enum Kind {
 }
 
 /// Reads measured points, in millimetres and in the order of the file. The file is text, PLY (its vertices are the
-/// points), QIF (its measured points), or a map of heights (its measured samples are the points).
+/// points), QIF or DMIS output (its measured points), or a map of heights (its measured samples are the points).
 ///
 /// The points of a map lie on the surface. The points of another file can lie on the surface or can be the centres of a
-/// spherical probe. Text and PLY do not show which; QIF can state it, and a note of [`read_measured_with_notes`] then
+/// spherical probe. Text and PLY do not show which; QIF and DMIS can state it, and a note of [`read_measured_with_notes`] then
 /// repeats it.
 ///
 /// # Errors
@@ -128,7 +128,7 @@ pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> 
     read_measured_with_notes(path, &Table::default()).map(|read| read.points)
 }
 
-/// Reads measured points from a text file, a PLY file, a QIF document or a map, as [`read_measured`] does. Returns the points in
+/// Reads measured points from a text file, a PLY file, QIF, DMIS output or a map, as [`read_measured`] does. Returns the points in
 /// millimetres, with notes on the content of the file that is ambiguous. If the file is a table, `table` gives the
 /// columns and units that the file does not state.
 ///
@@ -138,7 +138,7 @@ pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> 
 pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
     let wrong = |found, remedy| {
-        let expected = "measured points as text, PLY or QIF, or a map of heights of a known format";
+        let expected = "measured points as text, PLY, QIF or DMIS output, or a map of heights of a known format";
         Err(FormatError::WrongKind { path: path.to_owned(), expected, found, remedy })
     };
     let kind = kind(path)?;

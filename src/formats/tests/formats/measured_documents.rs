@@ -1,4 +1,4 @@
-//! Documents of measuring machines as measured points: QIF.
+//! Documents of measuring machines as measured points: QIF and DMIS output.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -81,4 +81,48 @@ fn qif_is_no_nominal_and_no_table() {
     assert!(matches!(read_measured(&path), Err(FormatError::Version { .. })));
     let (_folder, path) = file("part.xml", "<?xml version=\"1.0\"?>\n<points>1 2 3</points>\n");
     assert!(matches!(read_measured(&path), Err(FormatError::WrongKind { found: "an XML file", .. })));
+}
+
+const DMIS: &str = "FILNAM/'SN-7'\nUNITS/MM, ANGDEC\nPRCOMP/OFF\nF(P9)=FEAT/POINT,CART,91,92,93,0,0,1\nOUTPUT/FA(P9)\n\
+                    FA(P9)=FEAT/POINT,CART,4,5,6.5,0,0,1\nFA(P7) = FEAT/POINT,CART, $\n  1.5,-2.25,3,0,0,1\nENDFIL\n";
+
+#[test]
+fn dmis_output_is_measured() {
+    for name in ["part.res", "part.dmo", "part.txt", "part.csv"] {
+        let (_folder, path) = file(name, DMIS);
+        let (points, said) = measured(&path).unwrap();
+        assert_eq!(points, [Point::new(4.0, 5.0, 6.5), Point::new(1.5, -2.25, 3.0)]);
+        assert_eq!(said, Some((Coordinates::Centres, None)));
+    }
+    let (_folder, path) = file("part.res", &DMIS.replace("PRCOMP/OFF", "PRCOMP/ON").replace("UNITS/MM", "UNITS/INCH"));
+    let (points, said) = measured(&path).unwrap();
+    assert_near(&points, &[[101.6, 127.0, 165.1], [38.1, -57.15, 76.2]]);
+    assert_eq!(said, Some((Coordinates::Contacts, None)));
+    let (_folder, path) = file("part.res", &DMIS.replace("PRCOMP/OFF\n", ""));
+    assert_eq!(measured(&path).unwrap().1, None);
+}
+
+#[test]
+fn dmis_without_actual_points_is_refused() {
+    let (nominal, _) = DMIS.split_once("FA(P9)=").unwrap();
+    let (_folder, path) = file("part.res", &format!("{nominal}ENDFIL\n"));
+    assert!(matches!(read_measured(&path), Err(FormatError::WrongKind { .. })));
+    let program =
+        DMIS.replace("FILNAM/'SN-7'", "DMISMN/'SN-7', 05.2").replace("FA(P9)=", "F(A)=").replace("FA(P7) =", "F(B)=");
+    let (_folder, path) = file("part.dmi", &program);
+    assert!(matches!(read_measured(&path), Err(FormatError::WrongKind { .. })));
+    assert!(matches!(read_nominal(&path), Err(FormatError::WrongKind { .. })));
+    let (_folder, path) = file("part.res", &DMIS.replace("ENDFIL\n", ""));
+    assert!(matches!(read_measured(&path), Err(FormatError::Cut { .. })));
+    let (_folder, path) = file("part.res", &DMIS.replace("UNITS/MM, ANGDEC\n", ""));
+    assert!(matches!(read_measured(&path), Err(FormatError::Unexpected { .. })));
+}
+
+/// A table with a unit of DMIS above it stays a table.
+#[test]
+fn table_under_line_of_dmis_is_a_table() {
+    let (_folder, path) = file("part.txt", "UNITS/MM\nx,y,z\n1,2,3\n");
+    assert_eq!(measured(&path).unwrap(), (vec![Point::new(1.0, 2.0, 3.0)], None));
+    let (_folder, path) = file("part.txt", "UNITS/INCH\nx,y,z\n1,2,3\n");
+    assert!(matches!(read_measured(&path), Err(FormatError::Unit { .. })));
 }
