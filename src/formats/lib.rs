@@ -15,6 +15,7 @@ mod foreign;
 mod form_document;
 mod form_figures;
 pub mod gcode;
+mod grid_sag;
 mod height_map;
 mod jsonl_appender;
 mod layout;
@@ -93,6 +94,7 @@ pub use x3p::{MapRecord, X3pFile, escaped, parse_x3p, read_x3p, write_error_map_
 pub use xml::is_bounded_xml;
 
 use cad::cad_format;
+use grid_sag::is_grid_sag;
 use height_map::MapFormat;
 use layout::is_separator_line;
 use lens::lens_format;
@@ -109,6 +111,7 @@ enum Kind {
     Toml,
     Cad,
     Lens,
+    GridSag,
     Cloud(CloudFormat),
     Document(DocumentFormat),
     Map(&'static MapFormat),
@@ -150,6 +153,7 @@ pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result
         Kind::Toml => wrong("a TOML file", "give the definition as the nominal"),
         Kind::Cad => wrong("a CAD model", "give the model as the nominal"),
         Kind::Lens => wrong("a lens", "give the lens as the nominal"),
+        Kind::GridSag => wrong("a grid of sags of a lens", "give the grid as the nominal"),
         Kind::Cloud(format) => {
             let bytes = whole::open(path)?.read_all(path, whole::MAX_BYTES)?;
             parse_cloud(path, &bytes, format, table.unit)
@@ -215,6 +219,9 @@ fn kind(path: &Path) -> Result<Kind, FormatError> {
     }
     if lens_format(head).is_some() {
         return Ok(Kind::Lens);
+    }
+    if is_grid_sag(head) {
+        return Ok(Kind::GridSag);
     }
     foreign::check_is_ours(path, head)?;
     if ply::is_ply(head) {

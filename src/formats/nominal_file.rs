@@ -11,6 +11,7 @@ use super::cad::{CadModel, read_cad};
 use super::choice_error::ChoiceError;
 use super::columns::Table;
 use super::error::FormatError;
+use super::grid_sag::read_grid_sag;
 use super::lens::{LensModel, read_lens};
 use super::ply::{PlyFile, read_ply};
 use super::points::read_nominal_points;
@@ -169,6 +170,7 @@ pub fn read_nominal_as(path: impl AsRef<Path>, table: &Table) -> Result<NominalF
         }
         Kind::Cad => NominalFile::Faces(read_cad(path)?),
         Kind::Lens => NominalFile::Lens(read_lens(path)?),
+        Kind::GridSag => NominalFile::Points(read_grid_sag(path)?),
         Kind::Cloud(_) => {
             return Err(FormatError::WrongKind {
                 path: path.to_owned(),

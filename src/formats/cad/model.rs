@@ -1,5 +1,6 @@
 //! CAD model: faces, of which one is the nominal surface.
 
+use rayon::prelude::*;
 use regrind_core::geometry::Pose;
 use regrind_core::surface::SurfaceChoice;
 use regrind_core::surface::parametric::Face;
@@ -10,6 +11,9 @@ use super::super::error::FormatError;
 /// Share by which the largest face must exceed the next one. The areas are sums over small patches, with an error of
 /// about 1 %.
 const MIN_AREA_STEP: f64 = 0.02;
+
+/// Share of the largest rough area below which a face cannot be the largest.
+const MIN_ROUGH_SHARE: f64 = 0.7;
 
 /// Face of a CAD model as the file has it.
 #[derive(Clone, Debug, PartialEq)]
@@ -89,7 +93,14 @@ impl CadModel {
 
     /// Returns the number of the face with the largest area, among those that can be read.
     fn largest(&self) -> Result<usize, ChoiceError> {
-        let areas = (1..).zip(&self.faces).filter_map(|(n, face)| Some((n, face.face.as_ref().ok()?.area_mm2())));
+        let faces: Vec<(usize, &Face)> =
+            (1..).zip(&self.faces).filter_map(|(number, face)| Some((number, face.face.as_ref().ok()?))).collect();
+        let rough: Vec<f64> = faces.par_iter().map(|(_, face)| face.rough_area_mm2()).collect();
+        let largest = rough.iter().copied().filter(|area| area.is_finite()).fold(0.0, f64::max);
+        // A thin face can lie between the few places of a rough area.
+        let can_be_largest = |area: f64| area == 0.0 || area.is_nan() || area >= MIN_ROUGH_SHARE * largest;
+        let candidates = faces.into_iter().zip(rough).filter(|(_, area)| can_be_largest(*area));
+        let areas = candidates.map(|((number, face), _)| (number, face.area_mm2()));
         let areas: Vec<(usize, f64)> = areas.filter(|(_, area)| area.is_finite() && *area > 0.0).collect();
         let largest = areas.iter().fold(0.0f64, |largest, (_, area)| largest.max(*area));
         let alike = areas.iter().filter(|(_, area)| *area >= largest * (1.0 - MIN_AREA_STEP));

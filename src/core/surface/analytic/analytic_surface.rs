@@ -5,10 +5,13 @@ use std::sync::Arc;
 use nalgebra::Matrix3;
 use serde::{Deserialize, Serialize};
 
+use super::biconic_zernike::BiconicZernike;
 use super::conic::{Asphere, Conic};
 use super::error::{self, DefinitionError};
 use super::forbes::{Qbfs, Qcon};
 use super::polynomial::XyPolynomial;
+use super::q2d::Q2d;
+use super::tensor_polynomial::TensorPolynomial;
 use super::toroid::{Biconic, Toroid};
 use super::zernike::Zernike;
 use crate::geometry::pose::min_rotation;
@@ -206,6 +209,8 @@ pub enum AnalyticSurface {
     Toroid(Toroid),
     /// Two conics, one in x and one in y.
     Biconic(Biconic),
+    /// Two conics plus Zernike polynomials.
+    BiconicZernike(BiconicZernike),
     /// Powers of x and y.
     XyPolynomial(XyPolynomial),
     /// Zernike polynomials.
@@ -214,6 +219,10 @@ pub enum AnalyticSurface {
     Qcon(Qcon),
     /// Forbes' polynomials for mild aspheres.
     Qbfs(Qbfs),
+    /// Forbes' polynomials for freeform surfaces.
+    Q2d(Q2d),
+    /// Chebyshev or Legendre polynomials in x and y.
+    TensorPolynomial(TensorPolynomial),
     /// Sum of surfaces, each shifted.
     Sum(SurfaceSum),
     /// Face of a CAD model, of which the place (u, v) of each (x, y) is found.
@@ -236,7 +245,10 @@ impl AnalyticSurface {
             Self::OffAxis(section) => section.sag_and_gradient(x, y),
             Self::Toroid(toroid) => toroid.sag_and_gradient(x, y),
             Self::Biconic(biconic) => biconic.sag_and_gradient(x, y),
+            Self::BiconicZernike(surface) => surface.sag_and_gradient(x, y),
             Self::XyPolynomial(polynomial) => polynomial.sag_and_gradient(x, y),
+            Self::Q2d(q2d) => q2d.sag_and_gradient(x, y),
+            Self::TensorPolynomial(polynomial) => polynomial.sag_and_gradient(x, y),
             Self::Zernike(zernike) => zernike.sag_and_gradient(x, y),
             Self::Sum(sum) => sum.sag_and_gradient(x, y),
             Self::Face(field) => field.sag_and_gradient(x, y),
@@ -263,6 +275,8 @@ impl AnalyticSurface {
             Self::Zernike(zernike) => Some(zernike.normalisation_radius_mm),
             Self::Qcon(qcon) => Some(qcon.normalisation_radius_mm),
             Self::Qbfs(qbfs) => Some(qbfs.normalisation_radius_mm),
+            Self::Q2d(q2d) => Some(q2d.normalisation_radius_mm),
+            Self::BiconicZernike(surface) => Some(surface.normalisation_radius_mm()),
             Self::OffAxis(section) => section.parent().normalisation_radius_mm(),
             _ => None,
         }
@@ -286,6 +300,9 @@ impl AnalyticSurface {
             Self::OffAxis(section) => section.term_count(),
             Self::Toroid(toroid) => toroid.term_count(),
             Self::XyPolynomial(polynomial) => polynomial.term_count(),
+            Self::Q2d(q2d) => q2d.term_count(),
+            Self::BiconicZernike(surface) => surface.term_count(),
+            Self::TensorPolynomial(polynomial) => polynomial.term_count(),
             Self::Zernike(zernike) => zernike.term_count(),
             Self::Sum(sum) => sum.parts.iter().map(|(surface, _)| surface.term_count()).sum(),
             Self::Face(field) => field.term_count(),

@@ -23,10 +23,13 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue, ValueDeserializer};
 
 use super::analytic_surface::{AnalyticSurface, OffAxis, SectionFrame};
+use super::biconic_zernike::{BiconicZernike, BiconicZernikeDefinition};
 use super::conic::{Asphere, AsphereDefinition, Conic, ConicDefinition};
 use super::error::{self, DefinitionError};
 use super::forbes::{Qbfs, QbfsDefinition, Qcon, QconDefinition};
 use super::polynomial::{XyPolynomial, XyPolynomialDefinition};
+use super::q2d::{Q2d, Q2dDefinition};
+use super::tensor_polynomial::{PolynomialFamily, TensorPolynomial, TensorPolynomialDefinition};
 use super::toroid::{Biconic, BiconicDefinition, Toroid, ToroidDefinition};
 use super::zernike::{Zernike, ZernikeDefinition};
 use crate::geometry::Aperture;
@@ -66,6 +69,8 @@ pub enum Formula {
     Toroid(ToroidDefinition),
     /// Two conics, one in x and one in y.
     Biconic(BiconicDefinition),
+    /// Two conics, one in x and one in y, plus Zernike polynomials.
+    BiconicZernike(BiconicZernikeDefinition),
     /// Powers of x and y.
     XyPolynomial(XyPolynomialDefinition),
     /// Zernike polynomials.
@@ -74,6 +79,12 @@ pub enum Formula {
     Qcon(QconDefinition),
     /// Forbes' polynomials for mild aspheres.
     Qbfs(QbfsDefinition),
+    /// Forbes' polynomials for freeform surfaces.
+    Q2d(Q2dDefinition),
+    /// Chebyshev polynomials in x and y.
+    Chebyshev(TensorPolynomialDefinition),
+    /// Legendre polynomials in x and y.
+    Legendre(TensorPolynomialDefinition),
 }
 
 /// Kinds of [`Formula`] from which a section can be cut: all except the section itself. Used only for the schema.
@@ -88,10 +99,14 @@ pub(super) enum WholeFormula {
     Asphere(AsphereDefinition),
     Toroid(ToroidDefinition),
     Biconic(BiconicDefinition),
+    BiconicZernike(BiconicZernikeDefinition),
     XyPolynomial(XyPolynomialDefinition),
     Zernike(ZernikeDefinition),
     Qcon(QconDefinition),
     Qbfs(QbfsDefinition),
+    Q2d(Q2dDefinition),
+    Chebyshev(TensorPolynomialDefinition),
+    Legendre(TensorPolynomialDefinition),
 }
 
 /// [`Formula`] whose kind is the key of an inner table. A reader that must find `kind` first would buffer the other
@@ -106,10 +121,14 @@ enum FormulaByKind {
     OffAxis(OffAxisDefinition),
     Toroid(ToroidDefinition),
     Biconic(BiconicDefinition),
+    BiconicZernike(BiconicZernikeDefinition),
     XyPolynomial(XyPolynomialDefinition),
     Zernike(ZernikeDefinition),
     Qcon(QconDefinition),
     Qbfs(QbfsDefinition),
+    Q2d(Q2dDefinition),
+    Chebyshev(TensorPolynomialDefinition),
+    Legendre(TensorPolynomialDefinition),
 }
 
 /// [`Aperture`] whose kind is the key of an inner table, see [`FormulaByKind`].
@@ -250,10 +269,18 @@ impl Formula {
             Self::OffAxis(section) => AnalyticSurface::OffAxis(OffAxis::try_from(section)?),
             Self::Toroid(toroid) => AnalyticSurface::Toroid(Toroid::try_from(toroid)?),
             Self::Biconic(biconic) => AnalyticSurface::Biconic(Biconic::try_from(biconic)?),
+            Self::BiconicZernike(surface) => AnalyticSurface::BiconicZernike(BiconicZernike::try_from(surface)?),
             Self::XyPolynomial(polynomial) => AnalyticSurface::XyPolynomial(XyPolynomial::try_from(polynomial)?),
             Self::Zernike(zernike) => AnalyticSurface::Zernike(Zernike::try_from(zernike)?),
             Self::Qcon(qcon) => AnalyticSurface::Qcon(Qcon::try_from(qcon)?),
             Self::Qbfs(qbfs) => AnalyticSurface::Qbfs(Qbfs::try_from(qbfs)?),
+            Self::Q2d(q2d) => AnalyticSurface::Q2d(Q2d::try_from(q2d)?),
+            Self::Chebyshev(polynomial) => {
+                AnalyticSurface::TensorPolynomial(TensorPolynomial::new(PolynomialFamily::Chebyshev, polynomial)?)
+            }
+            Self::Legendre(polynomial) => {
+                AnalyticSurface::TensorPolynomial(TensorPolynomial::new(PolynomialFamily::Legendre, polynomial)?)
+            }
         })
     }
 }
@@ -440,7 +467,7 @@ mod tests {
 
     const CIRCLE: &str = "[aperture]\nkind = 'circle'\nradius_mm = 20\n";
 
-    const KINDS: [&str; 11] = [
+    const KINDS: [&str; 15] = [
         "plane",
         "sphere",
         "conic",
@@ -448,10 +475,14 @@ mod tests {
         "off-axis",
         "toroid",
         "biconic",
+        "biconic-zernike",
         "xy-polynomial",
         "zernike",
         "qcon",
         "qbfs",
+        "q2d",
+        "chebyshev",
+        "legendre",
     ];
 
     /// One definition of every kind.
@@ -465,11 +496,17 @@ mod tests {
              parent = { kind = 'conic', radius_mm = 400, conic = -1 }",
             "kind = 'toroid'\nradius_x_mm = 100\nradius_y_mm = inf\ncoefficients = { A2 = 1e-4 }",
             "kind = 'biconic'\nradius_x_mm = 100\nradius_y_mm = 80\nconic_x = 1",
+            "kind = 'biconic-zernike'\nradius_x_mm = 100\nradius_y_mm = inf\nnumbering = 'noll'\n\
+             normalisation_radius_mm = 20\ncoefficients_mm = { Z5 = 0.01 }",
             "kind = 'xy-polynomial'\nnormalisation_radius_mm = 10\nterms = [[1, 1, 0.01], [0, 3, 1]]",
             "kind = 'zernike'\nnumbering = 'fringe'\nnormalisation_radius_mm = 20\ncoefficients_mm = { Z5 = 0.01, 9 = 1e-3 }\n\
              base = { radius_mm = 200 }",
             "kind = 'qcon'\nradius_mm = 100\nconic = -1\nnormalisation_radius_mm = 20\ncoefficients_mm = [0.01, 0.002]",
             "kind = 'qbfs'\nradius_mm = 100\nnormalisation_radius_mm = 20\ncoefficients_mm = [0.01, 0.002]",
+            "kind = 'q2d'\nradius_mm = 100\nnormalisation_radius_mm = 20\ncoefficients_mm = [0.01]\n\
+             terms = [[0, 2, 0.01, 0], [1, 1, 0, 1e-3]]",
+            "kind = 'chebyshev'\nhalf_widths_mm = [20, 20]\nterms = [[1, 1, 0.01], [0, 3, 1]]\nbase = { radius_mm = 200 }",
+            "kind = 'legendre'\nhalf_widths_mm = [20, 25.5]\nterms = [[1, 1, 0.01], [0, 3, 1]]",
         ]
         .map(|surface| format!("{CIRCLE}[surface]\n{surface}\n"))
         .into()

@@ -10,18 +10,21 @@
 //! ```
 
 mod analytic_surface;
+mod biconic_zernike;
 mod conic;
 mod definition;
 mod error;
 mod forbes;
 mod jacobi;
-
 mod polynomial;
+mod q2d;
 mod sampling;
+mod tensor_polynomial;
 mod toroid;
 mod zernike;
 
 pub use analytic_surface::{AnalyticSurface, OffAxis, SectionFrame, SurfaceSum};
+pub use biconic_zernike::{BiconicZernike, BiconicZernikeDefinition};
 pub use conic::{Asphere, AsphereDefinition, Conic, ConicDefinition};
 pub use definition::{
     DefinedSurface, Formula, OffAxisDefinition, PlaneDefinition, Sampling, SamplingDefinition, SphereDefinition,
@@ -31,7 +34,9 @@ pub use error::DefinitionError;
 pub use forbes::{Qbfs, QbfsDefinition, Qcon, QconDefinition};
 pub(crate) use jacobi::values as jacobi_values;
 pub use polynomial::{XyPolynomial, XyPolynomialDefinition};
+pub use q2d::{Q2d, Q2dDefinition};
 pub use sampling::SampledSurface;
+pub use tensor_polynomial::{PolynomialFamily, TensorPolynomial, TensorPolynomialDefinition};
 pub use toroid::{Biconic, BiconicDefinition, Toroid, ToroidDefinition};
 pub use zernike::{Zernike, ZernikeDefinition, ZernikeNormalisation, ZernikeNumbering};
 

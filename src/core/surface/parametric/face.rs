@@ -122,7 +122,7 @@ impl Face {
         let centre = mean(&outline);
         let (trimmed, domain) = self.trimmed_domain();
         let trimmed = if trimmed.is_ambiguous() { trimmed.everything() } else { trimmed };
-        let near = self.patches(trimmed.bounds(domain), &trimmed).filter(|patch| patch.normal.norm() > 0.0);
+        let near = self.patches(trimmed.bounds(domain), &trimmed, PATCHES).filter(|patch| patch.normal.norm() > 0.0);
         let nearest =
             near.min_by(|a, b| (a.point - centre).norm_squared().total_cmp(&(b.point - centre).norm_squared()))?;
         let side = nearest.normal.dot(&around) * self.side().unwrap_or(1.0);
@@ -138,21 +138,26 @@ impl Face {
 
     /// Returns the area in mm^2, within about a per cent.
     pub fn area_mm2(&self) -> f64 {
-        area_mm2(&self.enclosed_patches())
+        area_mm2(&self.enclosed_patches(PATCHES))
     }
 
-    /// Returns small patches of the surface, those that the outlines enclose.
-    fn enclosed_patches(&self) -> Vec<SmallPatch> {
+    /// Returns the area in mm^2, within some per cent, in a twenty-fifth of the time.
+    pub fn rough_area_mm2(&self) -> f64 {
+        area_mm2(&self.enclosed_patches(PATCHES / 5))
+    }
+
+    /// Returns small patches of the surface, `count` in each direction, those that the outlines enclose.
+    fn enclosed_patches(&self, count: usize) -> Vec<SmallPatch> {
         let (trimmed, domain) = self.trimmed_domain();
         let enclosed = |trimmed: &TrimmedDomain| -> Vec<SmallPatch> {
-            let inside = |bounds| self.patches(bounds, trimmed);
+            let inside = |bounds| self.patches(bounds, trimmed, count);
             // Once over all of the domain, and once over the box of what is enclosed.
             let wide = trimmed.bounds(domain);
             let found = [0, 1].map(|k| range(inside(wide).map(|patch| patch.at[k])));
             if found[0][0] > found[0][1] {
                 return Vec::new();
             }
-            let cell = [0, 1].map(|k| (wide[k][1] - wide[k][0]) / PATCHES as f64);
+            let cell = [0, 1].map(|k| (wide[k][1] - wide[k][0]) / count as f64);
             let narrow =
                 [0, 1].map(|k| [(found[k][0] - cell[k]).max(wide[k][0]), (found[k][1] + cell[k]).min(wide[k][1])]);
             inside(narrow).collect()
@@ -176,7 +181,7 @@ impl Face {
     /// Returns the corners of the box along the axes of the file that contains the face.
     pub fn bounds(&self) -> [Point; 2] {
         let start = [Point::from(Vector::repeat(f64::INFINITY)), Point::from(Vector::repeat(f64::NEG_INFINITY))];
-        let patches = self.enclosed_patches().into_iter().map(|patch| patch.point);
+        let patches = self.enclosed_patches(PATCHES).into_iter().map(|patch| patch.point);
         let places = self.all_outlines().into_iter().flatten().chain(patches);
         places.fold(start, |[low, high], p| [low.inf(&p), high.sup(&p)])
     }
@@ -328,16 +333,17 @@ impl Face {
         &'a self,
         [u, v]: [[f64; 2]; 2],
         trimmed: &'a TrimmedDomain,
+        count: usize,
     ) -> impl Iterator<Item = SmallPatch> + 'a {
-        let place = |[low, high]: [f64; 2], i: usize| low + (high - low) * (i as f64 + 0.5) / PATCHES as f64;
-        let cell = (u[1] - u[0]) * (v[1] - v[0]) / (PATCHES * PATCHES) as f64;
+        let place = |[low, high]: [f64; 2], i: usize| low + (high - low) * (i as f64 + 0.5) / count as f64;
+        let cell = (u[1] - u[0]) * (v[1] - v[0]) / (count * count) as f64;
         let patch = move |at: [f64; 2]| {
             let [u, v] = trimmed.wrapped(at);
             let found = self.surface.evaluate(u, v);
             let area = found.area_vector();
             SmallPatch { at, point: found.point, normal: area, area_mm2: area.norm() * cell }
         };
-        let places = |bounds: [f64; 2]| (0..PATCHES).map(|i| place(bounds, i)).collect();
+        let places = |bounds: [f64; 2]| (0..count).map(|i| place(bounds, i)).collect();
         trimmed.enclosed(places(u), places(v)).map(patch)
     }
 }

@@ -93,6 +93,59 @@ fn faces_match_open_cascade() {
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
+/// Places between those of the table, against OpenCASCADE itself: within 1e-8 mm, also for files in inches.
+#[test]
+#[ignore = "needs OpenCASCADE: REGRIND_OCP_PYTHON is a Python with cadquery-ocp"]
+fn places_match_open_cascade_live() {
+    let python = std::env::var("REGRIND_OCP_PYTHON").expect("REGRIND_OCP_PYTHON is a Python with cadquery-ocp");
+    let (mut asked, mut normals) = (String::new(), Vec::new());
+    let files: Vec<(String, usize)> = places().into_keys().collect();
+    for (file, number) in files {
+        if file == "q-iges-matrix-nested.igs" || NOT_PLACED.iter().any(|(name, n, _)| *name == file && *n == number) {
+            continue;
+        }
+        let placement = placed(&face(&file, number), FaceFrame::Face).unwrap();
+        let [low, high] = placement.surface.aperture().bounds();
+        for (s, t) in [(0.5, 0.5), (0.31, 0.42), (0.67, 0.35), (0.44, 0.71), (0.6, 0.6)] {
+            let (x, y) = (low[0] + s * (high[0] - low[0]), low[1] + t * (high[1] - low[1]));
+            let found = placement.surface.formula().sag_and_gradient(x, y);
+            let Some((z, [gx, gy])) = found.filter(|_| placement.surface.aperture().distance_mm(x, y) == 0.0) else {
+                continue;
+            };
+            let point = placement.file_from_surface.transform_point(&Point::new(x, y, z));
+            asked += &format!("{file},{:?},{:?},{:?}\n", point.x, point.y, point.z);
+            let normal = Vector::new(-gx, -gy, 1.0).normalize();
+            normals.push((file.clone(), point, placement.file_from_surface.transform_direction(&normal)));
+        }
+    }
+    let mut child = std::process::Command::new(python)
+        .args([folder().join("opencascade.py"), folder()])
+        .stdin(std::process::Stdio::piped())
+        .stdout(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    std::io::Write::write_all(&mut child.stdin.take().unwrap(), asked.as_bytes()).unwrap();
+    let told = String::from_utf8(child.wait_with_output().unwrap().stdout).unwrap();
+    // Messages of OpenCASCADE stand between the lines.
+    let rows: Vec<Vec<f64>> = told
+        .lines()
+        .filter_map(|line| line.split(',').map(|cell| cell.trim().parse().ok()).collect::<Option<Vec<f64>>>())
+        .filter(|row| row.len() == 4)
+        .collect();
+    assert_eq!(rows.len(), normals.len());
+    assert!(rows.len() > 150, "{}", rows.len());
+    let mut wrong = Vec::new();
+    for ((file, point, normal), row) in normals.iter().zip(&rows) {
+        let other = Vector::new(row[1], row[2], row[3]);
+        let turned = (normal - other).norm().min((normal + other).norm());
+        let scale = point.coords.amax().max(1.0);
+        if row[0] > 1e-8 * scale || turned > 1e-7 {
+            wrong.push(format!("{file} at {point}: {:e} mm, {turned:e}", row[0]));
+        }
+    }
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
 #[test]
 fn areas_match_open_cascade() {
     let text = std::fs::read_to_string(folder().join("faces.csv")).unwrap();
