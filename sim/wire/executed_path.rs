@@ -87,18 +87,22 @@ impl ExecutedPath {
     /// Waits until the wheel has followed the whole path that the controller executed before this call.
     ///
     /// Returns at once in two cases: no helper program runs, so no path is reported, or another call began less than
-    /// 0.5 s before. Also returns if the helper program ends, or if it does not answer within 30 s.
+    /// 0.5 s before and has its answer. Also returns if the helper program ends, or if it does not answer within 30 s.
     pub async fn caught_up(&self) {
-        let question = {
+        let (question, is_new) = {
             let (question, when) = &mut *locked(&self.last_question);
-            if when.is_some_and(|when| when.elapsed() < QUESTION_VALIDITY) {
-                return;
+            let is_new = when.is_none_or(|when| when.elapsed() >= QUESTION_VALIDITY);
+            if is_new {
+                *question = question.wrapping_add(1).max(1);
+                *when = Some(Instant::now());
             }
-            *question = question.wrapping_add(1).max(1);
-            *when = Some(Instant::now());
-            *question
+            (*question, is_new)
         };
         let mut told = self.shared.report.subscribe();
+        if !is_new && *told.borrow() == HelperReport::Mark(question) {
+            return;
+        }
+        // Asked again while the answer is open: the program can have been started anew.
         let asked = locked(&self.shared.input).as_mut().is_some_and(|input| writeln!(input, "{question}").is_ok());
         if asked {
             let seen =
@@ -266,5 +270,19 @@ mod tests {
         // A question is not repeated within a short time.
         path.caught_up().await;
         assert_eq!(locked(&path.last_question).0, question);
+    }
+
+    /// A second caller waits too, although the question of the first is new.
+    #[cfg(unix)]
+    #[tokio::test]
+    async fn second_caller_waits_for_open_answer() {
+        // A controller that answers the second question only.
+        let told = "read first; read second; echo 1 0 0 90 1 $second; cat >/dev/null";
+        let mut command = Command::new("sh");
+        command.args(["-c", told]);
+        let world = World::new(WorldSpec::default()).unwrap();
+        let path = ExecutedPath::follow(command, world.wheel(12.5).unwrap()).unwrap();
+        tokio::join!(path.caught_up(), path.caught_up());
+        assert_eq!(*path.shared.report.borrow(), HelperReport::Mark(locked(&path.last_question).0));
     }
 }
