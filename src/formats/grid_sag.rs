@@ -149,7 +149,10 @@ mod tests {
     #[test]
     fn damaged_grids_are_refused() {
         let text = file(1.0, 0);
-        assert!(matches!(parse(&text[..text.len() - 20]), Err(FormatError::Cut { .. })));
+        // Cut at the end of a line, and within one.
+        let last_line = text.trim_end().rfind('\n').unwrap();
+        assert!(matches!(parse(&text[..last_line]), Err(FormatError::Cut { .. })));
+        assert!(matches!(parse(&text[..last_line + 5]), Err(FormatError::Unexpected { .. })));
         for damaged in [
             text.clone() + "1 0 0 0\n",
             text.replacen(" 1 10 0 0", " 1 10 0 2", 1),
