@@ -529,7 +529,7 @@ fn planned_programs_come_back_in_their_dialect() {
     for (name, rounding_mm) in DIALECTS {
         for arcs_within_mm in [None, Some(1e-4)] {
             let mut part = part("biconic");
-            part.programs.options = with(&part.programs.options, part.programs.options.wheel, 6.0);
+            part.programs.options = with(&part.programs.options, part.programs.options.wheel, 12.0);
             part.programs.dialect = dialect(name);
             part.programs.controller_tolerance_mm = Some(part.programs.path_tolerance_mm);
             (part.programs.arcs_within_mm, part.programs.part_identity) = (arcs_within_mm, PART);
@@ -556,7 +556,7 @@ fn planned_programs_come_back_in_their_dialect() {
                 worst = worst.max(off(found.at_mm));
                 points += 1;
             }
-            assert!(points > 100 && worst <= if rounding_mm > 1e-6 { 1e-4 } else { 1e-5 }, "{name}: {points}, {worst}");
+            assert!(points > 60 && worst <= if rounding_mm > 1e-6 { 1e-4 } else { 1e-5 }, "{name}: {points}, {worst}");
             let again = bench.correct("out", "again", &["--dialect", name]).unwrap_err();
             assert!(again.contains("already"), "{name}: {again}");
         }
