@@ -285,6 +285,13 @@ fn missing_unit_is_assumed_and_written() {
     assert!(text.find("G21 ").unwrap() < text.find("G0 X").unwrap(), "{text}");
     let stated = Shop::new(|_, _| 0.005, &format!("G21\n{program}")).compensate(&[]).unwrap();
     assert_eq!(stated.matches("G21").count(), 1);
+    // The first block of Klartext states the unit.
+    let klartext = "0 BEGIN PGM A MM\n1 L Z+50 R0 FMAX\n2 L X+0 Y+0 R0 FMAX\n3 L Z+1 R0 F500\n4 L X+10\n5 L Z+50 R0 FMAX M30\n6 END PGM A MM\n";
+    let bench = Shop::new(|_, _| 0.005, klartext);
+    let arguments = ["compensate", "--program", "base.ngc", "--map", "map.csv", "--out", "out.ngc", "--json"];
+    let (code, told, _) = run(&[&arguments[..], &["--dialect", "heidenhain"]].concat(), bench.folder());
+    let document: serde_json::Value = serde_json::from_str(&told).unwrap();
+    assert_eq!((code, &document["unit_assumed"]), (0, &false.into()));
 }
 
 #[test]
@@ -638,17 +645,26 @@ fn programs_of_shops_are_corrected_in_their_dialect() {
     ] {
         assert!(told.iter().any(|found| found.split_once(' ').unwrap().1 == line), "{line}: {told:#?}");
     }
+    // The header of Klartext has the unit, and a block may have a feed alone.
+    assert!(!text.contains("G21") && text.starts_with("0 BEGIN PGM MIRROR MM"), "{text}");
+    let inches = constant("heidenhain", &heidenhain.replace("MIRROR MM", "MIRROR INCH")).unwrap();
+    assert!(inches.starts_with("0 BEGIN PGM MIRROR INCH"), "{inches}");
+    let alone = heidenhain.replace("9 L Z+50 R0 FMAX M30", "9 L F700\n9 L Z+50 R0 FMAX M30");
+    let told = lines(&constant("heidenhain", &alone).unwrap());
+    assert!(told.iter().any(|found| found.ends_with("F700")), "{told:#?}");
     // Sinumerik: an assignment to an axis, and the radius of an arc.
     let sinumerik = "N10 G710 G90 G17\nN20 G0 X0 Y0 Z50 ; above\nN30 G1 Z=1 F500\nN40 G2 X10 Y0 CR=5\nN50 M30\n";
     let told = lines(&constant("sinumerik", sinumerik).unwrap());
     for line in ["G1 X0.000000 Y0.000000 Z0.996000", "G2 X10.000000 Y0.000000 Z0.996000 I5.000000 J0.000000", "M30"] {
         assert!(told.iter().any(|found| found.split_once(' ').is_some_and(|(_, rest)| rest == line)), "{told:#?}");
     }
-    // What is not known is refused with its line.
+    // An unknown line is refused with its number.
     for (name, program, line) in [
         ("fanuc", fanuc.replace("G02", "G65 P100"), 7),
         ("fanuc", fanuc.replace("G54", "G54 G43.4 H1"), 3),
         ("heidenhain", heidenhain.replace("L X+10 Y-2.5", "L IX+10 Y-2.5"), 7),
+        ("heidenhain", heidenhain.replace("L X+10 Y-2.5", "L \u{c4}+10 Y-2.5"), 7),
+        ("heidenhain", heidenhain.replace("CC X+10 Y+0", "CC \u{c4}+10 \u{d6}+0"), 8),
         ("heidenhain", heidenhain.replace("R0 F500", "RL F500"), 6),
         ("heidenhain", heidenhain.replace("6 L X+10 Y-2.5", "6 CALL LBL 1"), 7),
         ("heidenhain", heidenhain.replace("7 CC X+10 Y+0\n", ""), 8),

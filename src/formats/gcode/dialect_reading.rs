@@ -78,7 +78,10 @@ impl<'a> DialectReader<'a> {
             return Ok(NeutralLine::copied(text, ""));
         }
         let squeezed_text = squeezed(text);
-        let is_frame = self.frame.iter().any(|template| fits(template, &squeezed_text)) || self.is_name(&squeezed_text);
+        // The first block of Klartext also selects the unit.
+        let selects_unit = !has_g_words(self.dialect) && squeezed_text.starts_with("BEGINPGM");
+        let is_frame = !selects_unit
+            && (self.frame.iter().any(|template| fits(template, &squeezed_text)) || self.is_name(&squeezed_text));
         let is_described = self.templates.iter().any(|template| fits(template, &squeezed(code)));
         if is_frame || is_described || self.is_unit(code) {
             let words = known_words(code);
@@ -87,9 +90,8 @@ impl<'a> DialectReader<'a> {
             return Ok(NeutralLine { is_frame, ..NeutralLine::copied(text, words) });
         }
         let words = if has_g_words(self.dialect) { self.g_words(code)? } else { self.klartext(text, code)? };
-        let NeutralLine { words, copied, .. } = words;
         let comment = comment.map_or(String::new(), |words| format!(" ;{words}"));
-        Ok(NeutralLine { words: words + &comment, copied, is_frame: false })
+        Ok(NeutralLine { words: words.words + &comment, ..words })
     }
 
     /// Returns a line without the number of its block.
@@ -309,7 +311,7 @@ fn straight(tokens: &[&str]) -> Result<String, Refusal> {
 fn axis_words(tokens: &[&str]) -> Result<(String, bool), Refusal> {
     let (mut words, mut is_rapid) = (Vec::new(), false);
     for token in tokens {
-        let (letter, number) = token.split_at(1);
+        let (letter, number) = token.split_at_checked(1).unwrap_or((token, ""));
         let is_number = number.parse::<f64>().is_ok_and(f64::is_finite) && !number.contains(['E', 'e']);
         match (letter, *token) {
             (_, "R0") => {}
@@ -335,13 +337,16 @@ fn centre(tokens: &[&str]) -> Result<String, Refusal> {
     let refused =
         || (format!("the centre CC {} is not known", tokens.join(" ")), "write two of X, Y and Z with numbers");
     let [a, b] = *tokens else { return Err(refused()) };
-    let (plane, letters) = match (&a[..1], &b[..1]) {
+    let (Some((a, a_number)), Some((b, b_number))) = (a.split_at_checked(1), b.split_at_checked(1)) else {
+        return Err(refused());
+    };
+    let (plane, letters) = match (a, b) {
         ("X", "Y") => ("G17", ["I", "J"]),
         ("X", "Z") => ("G18", ["I", "K"]),
         ("Y", "Z") => ("G19", ["J", "K"]),
         _ => return Err(refused()),
     };
-    let numbers = [&a[1..], &b[1..]];
+    let numbers = [a_number, b_number];
     if numbers.iter().any(|number| !number.parse::<f64>().is_ok_and(f64::is_finite)) {
         return Err(refused());
     }

@@ -15,7 +15,7 @@ pub(super) struct DialectWriter<'a> {
     inches: bool,
     /// Plane of arcs: 0 for x and y, 1 for z and x, 2 for y and z.
     plane: usize,
-    /// Feed that the next move at feed states, in Klartext.
+    /// Feed in Klartext that no line has stated yet. The next move at feed states it, or a line of its own.
     feed: Option<String>,
 }
 
@@ -83,6 +83,10 @@ impl<'a> DialectWriter<'a> {
                 _ => self.functions(&mut out, &block),
             }
         }
+        if let Some(feed) = self.feed.take() {
+            let line = format!("{}{feed}", self.dialect.words.line);
+            self.line(&mut out, &line);
+        }
         Ok(out)
     }
 
@@ -100,8 +104,8 @@ impl<'a> DialectWriter<'a> {
         }
     }
 
-    /// Writes functions in Klartext. A feed waits for the next move; other words are those of the state, which Klartext
-    /// does not have.
+    /// Writes functions in Klartext. A feed waits for a move of the same lines, or for their end; other words are those of
+    /// the state, which Klartext does not have.
     fn functions(&mut self, out: &mut Vec<u8>, block: &Block) {
         for word in &block.words {
             match word.letter {
