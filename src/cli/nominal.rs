@@ -134,5 +134,8 @@ pub(super) fn kind_in_words(kind: NominalKind, choice: Option<String>) -> String
         NominalKind::Mesh => "mesh".into(),
         NominalKind::Patches { count } => format!("{count} patches"),
     };
-    choice.map_or(kind.clone(), |choice| format!("{choice}; {kind}"))
+    match choice {
+        Some(choice) => format!("{choice}; {kind}"),
+        None => kind,
+    }
 }

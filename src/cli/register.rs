@@ -101,7 +101,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 }
 
 /// Reads the nominal file and the measured file that `arguments` name, in parallel. Returns the nominal surface with
-/// the words that say which of several it is, and the measured points. The points contain notes about doubtful lines, for example a last line without a line end.
+/// the words that say which of several it is, and the measured points. The points contain notes about doubtful lines, for
+/// example a last line without a line end.
 ///
 /// Returns an error if a file is invalid. Also returns an error if the measured file is a height map (X3P, SDF or
 /// MetroPro) and the method of the registration is not `Contact`.

@@ -173,7 +173,7 @@ pub(super) fn correlation_factors(pairs: &[PairRows], maps: &[ProjectedMap], noi
     }
     let median = |mut ratios: Vec<f64>| {
         ratios.sort_by(f64::total_cmp);
-        // Of two in the middle the larger one.
+        // An even number of ratios has two in the middle: the larger one counts.
         ratios.get(ratios.len() / 2).copied().unwrap_or(1.0).max(1.0)
     };
     ratios.into_iter().map(median).collect()

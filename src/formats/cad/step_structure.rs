@@ -30,7 +30,7 @@ pub(super) struct Structure {
     same: HashMap<u64, u64>,
     /// Sizes of the sets, by the one that stands for the set.
     sizes: HashMap<u64, usize>,
-    /// Where the representations of a set occur: the outer one, and the two placements whose frames coincide.
+    /// Occurrences of a set of representations: the outer one, and the two placements whose frames coincide.
     outer: HashMap<u64, Vec<Occurrence>>,
     /// Contexts that state a unit of length, in the order of the file.
     contexts_with_units: Vec<u64>,

@@ -49,7 +49,7 @@ pub(super) struct StepText<'a> {
     places: HashMap<u64, usize>,
     /// The numbers in the order of the file.
     order: Vec<u64>,
-    /// Where the lines end, found when the first error needs it.
+    /// Ends of the lines. The first error that names a line finds them.
     line_ends: OnceCell<Vec<usize>>,
 }
 

@@ -40,7 +40,7 @@ const OF_SURFACES: [&str; 27] = [
 #[derive(Clone, Default)]
 struct Block {
     label: String,
-    /// StatementWord of the type: SPH, CON, ASP, YTO and so on; `XYP` and its like of a special surface.
+    /// Word of the type: SPH, CON, ASP, YTO and so on; `XYP` and its like of a special surface.
     kind: String,
     /// Number of the `S` statement: a radius or a curvature.
     value: f64,
@@ -82,7 +82,7 @@ pub(super) fn parse_codev(path: &Path, text: &str) -> Result<LensModel, FormatEr
     Ok(LensModel { surfaces })
 }
 
-/// StatementWord of a statement. A text in quotes is one word, and neither a keyword nor a number.
+/// Word of a statement. A text in quotes is one word, and neither a keyword nor a number.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct StatementWord {
     text: String,

@@ -140,7 +140,7 @@ impl TrimmedDomain {
     /// Tells whether the outlines enclose the place `at` of a scan line, by the number of their edges beyond it.
     fn contains(&self, crossings: &[f64], at: f64) -> bool {
         let other = 1 - self.constant;
-        // Where the parameter repeats, the turn in which the outlines lie.
+        // A parameter with a period names the same place in every turn: take the turn in which the outlines lie.
         let at = unwrapped(at, self.middle[other], self.period[other]);
         let beyond = crossings.iter().filter(|crossing| at < **crossing).count();
         self.outlines.is_empty() || (beyond % 2 == 1) != self.is_inverted
