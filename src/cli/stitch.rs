@@ -1,10 +1,13 @@
 //! `regrind stitch`: registers several maps or clouds of one part together.
 
 use std::fmt::Write as _;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
-use regrind::formats::{NominalInput, NotedPoints, ResultFolder, read_measured_with_notes, save_stitching};
+use regrind::formats::{
+    NominalInput, NotedPoints, RegistrationDocument, ResultFolder, STITCHED_POINTS, StitchingDocument,
+    read_measured_with_notes, save_stitching,
+};
 use regrind::geometry::Pose;
 use regrind::stitching::{MeasuredMap, Seam, Stitching, StitchingError, StitchingOptions, stitch};
 
@@ -90,8 +93,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         arguments.measured.iter().cloned().zip(maps.iter().map(|map| map.points.len())).collect();
     let kind = kind_in_words(nominal.kind(), choice);
     let input = NominalInput { file: &arguments.nominal, points: nominal.len(), kind };
-    let document =
-        save_stitching(folder.path(), &stitching, &files, input, &registration).map_err(Failure::NotSaved)?;
+    let document = StitchingDocument::new(&stitching, &files);
+    let whole = RegistrationDocument::new(&stitching.whole, &registration, input, Path::new(STITCHED_POINTS));
+    document.check().and(whole.check()).map_err(|what| Failure::NotFinite { what })?;
+    save_stitching(folder.path(), &stitching, &document, &whole).map_err(Failure::NotSaved)?;
     if arguments.json {
         super::print_json(&document)?;
     } else {

@@ -84,7 +84,7 @@ pub use registration::{
 };
 pub use scanner_cloud::parse_scanner_cloud;
 pub use sdf::{parse_sdf, read_sdf};
-pub use stitching_document::{StitchingDocument, save_stitching};
+pub use stitching_document::{STITCHED_POINTS, StitchingDocument, save_stitching};
 pub use stl::{StlFile, parse_stl, read_stl};
 pub use system::{OpenToOthers, is_same_file, readable_by_others, user_name};
 pub use unit::Unit;
