@@ -11,7 +11,7 @@ use std::path::Path;
 use regrind::cell::{Command, Ending, Event, Judgement};
 use regrind::compensation::Correction;
 use regrind::compensation::path::{HeightField, TargetSurface};
-use regrind::config::CellConfig;
+use regrind::config::{CellConfig, read_named_dialect};
 use regrind::device::file_exchange::ResultRequirements;
 use regrind::document::Problems;
 use regrind::drive::{Reply, Request};
@@ -241,7 +241,7 @@ fn assert_told(text: &str, problems: Option<Problems>) -> bool {
 
 // ---- programs -----------------------------------------------------------------------------------------------------------------------
 
-/// A program that exists already, corrected along z and along the normals of a plane.
+/// A program that exists already, corrected along z and along the normals of a plane, and along z in each dialect.
 pub fn program(bytes: &[u8]) -> bool {
     let folder = folder();
     let (base, out) = (folder.path().join("base.ngc"), folder.path().join("out.ngc"));
@@ -260,14 +260,19 @@ pub fn program(bytes: &[u8]) -> bool {
         simulation: true,
     };
     let mut is_read = false;
-    for along_normals in [None, Some(AlongNormals { nominal: &nominal, centre_above_mm: 5.0 })] {
+    let dialects = ["fanuc", "sinumerik", "heidenhain"]
+        .map(|name| read_named_dialect(name, Path::new("")).expect("a dialect of the program").dialect);
+    let along = AlongNormals { nominal: &nominal, centre_above_mm: 5.0 };
+    let cases = [(None, None), (Some(along), None)];
+    let cases = cases.into_iter().chain(dialects.iter().map(|dialect| (None, Some(dialect))));
+    for (along_normals, dialect) in cases {
         let amendment = Amendment {
             shift: &shift,
             along_normals,
             tolerance_mm: 1e-3,
             map: &map,
             gain: 1.0,
-            dialect: None,
+            dialect,
             max_shift_mm: 0.5,
         };
         let amended = correct_program(&base, &out, &amendment);
