@@ -13,7 +13,7 @@ use super::failure::Failure;
 use super::initial::read_pose;
 use super::{above_zero, finite_above_zero, finite_from_zero};
 
-/// Columns and units of measured tables, given by a person.
+/// Columns and units of measured tables, and the distance of the samples of maps, given by a person.
 #[derive(Args, Debug)]
 pub(super) struct MeasuredTable {
     /// Columns of the measured table, by name or by number from 1, if its header does not identify them
@@ -25,11 +25,19 @@ pub(super) struct MeasuredTable {
     /// Unit of z in the measured table, if it differs from that of x and y
     #[arg(long, value_name = "UNIT")]
     height_unit: Option<Unit>,
+    /// Distance of the samples of a map of heights, in mm along x and y, if the map does not state it
+    #[arg(long, value_name = "MM", allow_negative_numbers = true, value_parser = finite_above_zero)]
+    sample_spacing: Option<f64>,
 }
 
 impl MeasuredTable {
     pub(super) fn table(&self) -> Table {
-        Table { columns: self.columns.clone(), unit: self.unit, height_unit: self.height_unit }
+        Table {
+            columns: self.columns.clone(),
+            unit: self.unit,
+            height_unit: self.height_unit,
+            sample_spacing_mm: self.sample_spacing,
+        }
     }
 }
 

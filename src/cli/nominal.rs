@@ -45,7 +45,8 @@ pub(super) struct NominalTable {
 
 impl NominalTable {
     pub(super) fn table(&self) -> Table {
-        Table { columns: self.nominal_columns.clone(), unit: self.nominal_unit, height_unit: self.nominal_height_unit }
+        let (unit, height_unit) = (self.nominal_unit, self.nominal_height_unit);
+        Table { columns: self.nominal_columns.clone(), unit, height_unit, sample_spacing_mm: None }
     }
 
     pub(super) fn selection(&self) -> SurfaceSelection {

@@ -20,7 +20,8 @@ use serde::{Deserialize, Serialize};
 use super::error::{FormatError, excerpt};
 use super::unit::Unit;
 
-/// Columns and units of a table of points, given by a person because the table does not state them clearly.
+/// Columns and units of a table of points, or the distance of the samples of a map, given by a person because the file
+/// does not state them clearly.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Table {
     /// Columns of x, y and z; `None` for those that the header names.
@@ -29,6 +30,8 @@ pub struct Table {
     pub unit: Option<Unit>,
     /// Unit of z, if it differs from that of x and y.
     pub height_unit: Option<Unit>,
+    /// Distance of the samples of a map along x and y, in mm, if the map does not state it.
+    pub sample_spacing_mm: Option<f64>,
 }
 
 impl Table {

@@ -151,9 +151,24 @@ pub enum FormatError {
     /// A map whose scale (lateral size) is unknown.
     #[error(
         "{path}: the map has no lateral scale (the resolution in the file is {found} m per pixel), so its size in x \
-         and y is unknown; calibrate the lateral resolution in the instrument's program and save the map again"
+         and y is unknown; calibrate the lateral resolution in the instrument's program and save the map again, or \
+         give the distance of its samples (--sample-spacing, or sample_spacing_mm in the cell file)"
     )]
     NoLateralScale { path: PathBuf, found: f64 },
+    /// A distance of the samples that is given for a map that states its own.
+    #[error(
+        "{path}: a distance of the samples of {given} mm is given, but the map states its own ({} mm along x, {} mm \
+         along y); remove the given one (--sample-spacing, or sample_spacing_mm in the cell file)",
+        stated_mm[0],
+        stated_mm[1]
+    )]
+    LateralScaleStated { path: PathBuf, stated_mm: [f64; 2], given: f64 },
+    /// A distance of the samples that is given for a file that is no map over a regular grid.
+    #[error(
+        "{path}: a distance of the samples is given, but the file is not a map of heights over a regular grid; remove \
+         the distance (--sample-spacing, or sample_spacing_mm in the cell file)"
+    )]
+    NotAMap { path: PathBuf },
     /// A file could not be written; an existing file of that name is unchanged.
     #[error("{path}: {action} failed: {source}; check the name, the permissions and the free space")]
     Unwritable { path: PathBuf, action: &'static str, source: io::Error },

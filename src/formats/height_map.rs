@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::error::FormatError;
 use super::number::{LIMIT_MM, is_believable};
+use super::whole::{MAX_BYTES, open};
 use regrind_core::geometry::{Grid, GridMap, Point};
 use regrind_figures::statistics::rms;
 
@@ -104,28 +105,34 @@ impl HeightMap {
 pub(super) struct MapFormat {
     /// Returns true if the first bytes of a file are those of this format.
     pub(super) begins: fn(&[u8]) -> bool,
-    /// Reads a file.
-    pub(super) read: fn(&Path) -> Result<MapPoints, FormatError>,
-    /// Parses the bytes of a file; the path names the file in messages.
-    pub(super) parse: fn(&Path, &[u8]) -> Result<MapPoints, FormatError>,
+    /// Parses the bytes of a file; the path names the file in messages. The number is the distance of the samples in mm
+    /// that a person gives for a file that states none.
+    pub(super) parse: fn(&Path, &[u8], Option<f64>) -> Result<MapPoints, FormatError>,
 }
 
 impl MapFormat {
-    /// Reads the measured points of the map in the file `path`.
+    /// Reads the measured points of the map in the file `path`. `given_mm` is the distance of its samples, if a person
+    /// gives it because the file does not state it.
     ///
     /// # Errors
-    /// A file that cannot be read or is not valid; heights that look like marks of missing samples ([`check_marks`]).
-    pub(super) fn read_points(&self, path: &Path) -> Result<MapPoints, FormatError> {
-        let map = (self.read)(path)?;
-        check_marks(path, map.points.iter().map(|point| point.z)).map(|()| map)
+    /// A file that cannot be read; the same as for [`Self::parse_points`].
+    pub(super) fn read_points(&self, path: &Path, given_mm: Option<f64>) -> Result<MapPoints, FormatError> {
+        self.parse_points(path, &open(path)?.read_all(path, MAX_BYTES)?, given_mm)
     }
 
-    /// Reads the measured points of a map from the bytes of its file; `path` only names the file in messages.
+    /// Reads the measured points of a map from the bytes of its file; `path` only names the file in messages. `given_mm`
+    /// is the same as for [`Self::read_points`].
     ///
     /// # Errors
-    /// Bytes that are not valid; heights that look like marks of missing samples ([`check_marks`]).
-    pub(super) fn parse_points(&self, path: &Path, bytes: &[u8]) -> Result<MapPoints, FormatError> {
-        let map = (self.parse)(path, bytes)?;
+    /// Bytes that are not valid; heights that look like marks of missing samples ([`check_marks`]); a distance of the
+    /// samples that is neither stated nor given, or both ([`sample_spacing_mm`]).
+    pub(super) fn parse_points(
+        &self,
+        path: &Path,
+        bytes: &[u8],
+        given_mm: Option<f64>,
+    ) -> Result<MapPoints, FormatError> {
+        let map = (self.parse)(path, bytes, given_mm)?;
         check_marks(path, map.points.iter().map(|point| point.z)).map(|()| map)
     }
 }
@@ -154,6 +161,25 @@ fn check_marks(path: &Path, heights_mm: impl Iterator<Item = f64> + Clone) -> Re
         }
     }
     Ok(())
+}
+
+/// Returns the distances of the samples of a map along x and y, in mm: `stated_mm`, those of the file, or `given_mm` for
+/// both if the file states none, which is 0 or not a number. `path` only names the file in messages.
+///
+/// # Errors
+/// Distances that are neither stated nor given, or both.
+pub(super) fn sample_spacing_mm(
+    path: &Path,
+    stated_mm: [f64; 2],
+    given_mm: Option<f64>,
+) -> Result<[f64; 2], FormatError> {
+    let unstated = stated_mm.into_iter().find(|stated| !(*stated > 0.0 && stated.is_finite()));
+    match (unstated, given_mm) {
+        (None, None) => Ok(stated_mm),
+        (Some(_), Some(given)) if given > 0.0 && given.is_finite() => Ok([given; 2]),
+        (Some(found), _) => Err(FormatError::NoLateralScale { path: path.to_owned(), found: 1e-3 * found }),
+        (None, Some(given)) => Err(FormatError::LateralScaleStated { path: path.to_owned(), stated_mm, given }),
+    }
 }
 
 /// Measured points of a map, and notes on how ambiguous content was read.
@@ -202,6 +228,21 @@ mod tests {
         assert_eq!((map.pv_mm(), map.heights.values_mm[4]), (5.0, 0.0));
         // 0 1 2 3 5: mean 2.2, squared deviations from it 4.84 1.44 0.04 0.64 7.84.
         assert!((map.rms_mm() - (14.8f64 / 5.0).sqrt()).abs() < 1e-15);
+    }
+
+    #[test]
+    fn sample_spacing_is_stated_or_given() {
+        let of = |stated_mm, given_mm| sample_spacing_mm(Path::new("m"), stated_mm, given_mm);
+        assert_eq!(of([0.1, 0.2], None).unwrap(), [0.1, 0.2]);
+        for unstated in [[0.0; 2], [0.1, 0.0], [f64::NAN, 0.1], [f64::INFINITY; 2], [-1.0; 2]] {
+            assert!(matches!(of(unstated, None), Err(FormatError::NoLateralScale { .. })));
+            assert_eq!(of(unstated, Some(0.3)).unwrap(), [0.3; 2]);
+            for wrong in [0.0, -0.1, f64::NAN, f64::INFINITY] {
+                assert!(matches!(of(unstated, Some(wrong)), Err(FormatError::NoLateralScale { .. })));
+            }
+        }
+        let both = of([0.1, 0.2], Some(0.1));
+        assert!(matches!(both, Err(FormatError::LateralScaleStated { stated_mm: [0.1, 0.2], given: 0.1, .. })));
     }
 
     #[test]

@@ -137,7 +137,7 @@ pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> 
 ///
 /// # Errors
 /// The same as for [`read_measured`]; columns that do not exist; columns or a unit in `table` for a file that is not a
-/// table.
+/// table; a distance of the samples for a file that is not a map, or that states its own.
 pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
     let wrong = |found, remedy| {
@@ -159,7 +159,7 @@ pub fn read_measured_with_notes(path: impl AsRef<Path>, table: &Table) -> Result
             parse_cloud(path, &bytes, format, table.unit)
         }
         Kind::Document(format) => parse_document(path, &whole::open(path)?.read_all(path, result::MAX_BYTES)?, format),
-        Kind::Map(format) => format.read_points(path).map(|map| {
+        Kind::Map(format) => format.read_points(path, table.sample_spacing_mm).map(|map| {
             let note = |note| PointNote::Map { path: path.to_owned(), note };
             NotedPoints { points: map.points, notes: map.notes.into_iter().map(note).collect() }
         }),
@@ -180,9 +180,13 @@ pub fn read_plan(path: impl AsRef<Path>, table: &Table) -> Result<Vec<Point>, Fo
     }
 }
 
-/// Rejects a file of the format `kind` if `table` gives columns or a unit and the format is not a table of text. Other
-/// formats state their coordinates themselves.
+/// Rejects a file of the format `kind` if `table` gives columns or a unit and the format is not a table of text, or the
+/// distance of the samples and the format is not a map. Other formats state their coordinates themselves.
 fn check_is_table(path: &Path, kind: &Kind, table: &Table) -> Result<(), FormatError> {
+    if table.sample_spacing_mm.is_some() && !matches!(kind, Kind::Map(_)) {
+        return Err(FormatError::NotAMap { path: path.to_owned() });
+    }
+    let table = &Table { sample_spacing_mm: None, ..table.clone() };
     // A cloud tells by itself whether it needs a unit.
     let of_cloud = matches!(kind, Kind::Cloud(_)) && table.columns.is_none() && table.height_unit.is_none();
     if matches!(kind, Kind::Text) || of_cloud || *table == Table::default() {

@@ -30,15 +30,17 @@ pub(super) fn map_format(head: &[u8]) -> Option<&'static MapFormat> {
 }
 
 /// Parses the content of a map of any format. Returns its measured samples as points in millimetres. `path` only names
-/// the file in messages.
+/// the file in messages. `sample_spacing_mm` is the distance of the samples along x and y for a map that does not state
+/// it.
 ///
 /// # Errors
-/// Bytes of no known format, or that are not valid; heights that look like marks of samples that were not measured.
-pub fn parse_map(path: &Path, bytes: &[u8]) -> Result<Vec<Point>, FormatError> {
+/// Bytes of no known format, or that are not valid; heights that look like marks of samples that were not measured; a
+/// distance of the samples that is neither stated nor given, or both.
+pub fn parse_map(path: &Path, bytes: &[u8], sample_spacing_mm: Option<f64>) -> Result<Vec<Point>, FormatError> {
     let Some(format) = map_format(bytes) else {
         return Err(FormatError::NoData { path: path.to_owned(), expected: "map of a known format" });
     };
-    format.parse_points(path, bytes).map(|map| map.points)
+    format.parse_points(path, bytes, sample_spacing_mm).map(|map| map.points)
 }
 
 /// Returns true if a file is a map of heights, judged by its first bytes.

@@ -9,7 +9,7 @@
 use std::path::Path;
 
 use super::error::FormatError;
-use super::height_map::{HeightMap, MapFormat, check_size};
+use super::height_map::{HeightMap, MapFormat, check_size, sample_spacing_mm};
 use super::whole::open;
 use regrind_core::geometry::Grid;
 
@@ -23,8 +23,7 @@ const MIN_HEADER: usize = 834;
 /// MetroPro format, detected by its first bytes.
 pub(super) const FORMAT: MapFormat = MapFormat {
     begins: is_metropro,
-    read: |path| read_metropro(path).map(Into::into),
-    parse: |path, bytes| parse_metropro(path, bytes).map(Into::into),
+    parse: |path, bytes, given_mm| parse_metropro_with(path, bytes, given_mm).map(Into::into),
 };
 
 /// Reads a MetroPro map of at most 1 GiB. Returns the heights on a grid, in millimetres.
@@ -42,13 +41,15 @@ pub fn read_metropro(path: impl AsRef<Path>) -> Result<HeightMap, FormatError> {
 /// # Errors
 /// The same as for [`read_metropro`].
 pub fn parse_metropro(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+    parse_metropro_with(path, bytes, None)
+}
+
+/// Parses as [`parse_metropro`]; `given_mm` is the distance of the samples for a file that states none.
+fn parse_metropro_with(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<HeightMap, FormatError> {
     let header = Header::read(path, bytes)?;
     let [columns, rows] = header.size;
     let unit_mm = header.unit_mm(path)?;
-    let pitch_m = header.pitch_m;
-    if !(pitch_m > 0.0 && pitch_m.is_finite()) {
-        return Err(FormatError::NoLateralScale { path: path.to_owned(), found: pitch_m });
-    }
+    let spacing_mm = sample_spacing_mm(path, [1e3 * header.pitch_m; 2], given_mm)?;
     let raw = bytes.get(header.begin..header.begin + 4 * columns * rows).ok_or_else(|| FormatError::Cut {
         path: path.to_owned(),
         place: format!("byte {}", bytes.len()),
@@ -59,7 +60,7 @@ pub fn parse_metropro(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatErro
         (raw < NOT_MEASURED).then(|| f64::from(raw) * unit_mm)
     };
     let samples = raw.chunks_exact(4 * columns).rev().flat_map(|row| row.chunks_exact(4).map(height));
-    HeightMap::new(path, Grid { columns, rows, first_mm: [0.0; 2], spacing_mm: [1e3 * pitch_m; 2] }, samples)
+    HeightMap::new(path, Grid { columns, rows, first_mm: [0.0; 2], spacing_mm }, samples)
 }
 
 /// Returns true if `head`, the beginning of a file, has the magic number of MetroPro.

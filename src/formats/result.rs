@@ -161,8 +161,11 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     let statements = read_statements(path, text)?;
     let coordinates = agreed_coordinates(path, &statements, content)?;
     if let Some(format) = map_format(text) {
-        let MapPoints { points, notes } = format.parse_points(path, text)?;
+        let MapPoints { points, notes } = format.parse_points(path, text, content.sample_spacing_mm)?;
         return Ok(ResultFile { points, coordinates, notes, statements, ..ResultFile::default() });
+    }
+    if content.sample_spacing_mm.is_some() {
+        return Err(FormatError::NotAMap { path: path.to_owned() });
     }
     // Both formats state their own unit.
     if qif::is_xml(text) {
@@ -179,8 +182,8 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
         DecimalMark::Comma => Some(Decimal::Comma),
     };
     let height_unit = content.height_unit;
-    let table =
-        Table { columns: content.columns.clone(), unit: (unit != Unit::Millimetre).then_some(unit), height_unit };
+    let unit_or_mm = (unit != Unit::Millimetre).then_some(unit);
+    let table = Table { columns: content.columns.clone(), unit: unit_or_mm, height_unit, ..Table::default() };
     let (points, columns) = if is_ply {
         let mut points = ply::parse_ply_in(path, text, [unit, height_unit.unwrap_or(unit)])?.points;
         table.to_mm(&mut points);

@@ -52,6 +52,8 @@ pub struct Content {
     pub height_unit: Option<Unit>,
     /// Columns x, y and z of the files, if their headers do not name them.
     pub columns: Option<Columns>,
+    /// Distance of the samples of maps, in mm, if they do not state it.
+    pub sample_spacing_mm: Option<f64>,
 }
 
 /// Properties of a measurement that a result file states; `None` for a property that it does not state.

@@ -11,7 +11,7 @@ use std::path::Path;
 
 use super::error::{FormatError, excerpt};
 use super::foreign::check_is_ours;
-use super::height_map::{HeightMap, MapFormat, check_size};
+use super::height_map::{HeightMap, MapFormat, check_size, sample_spacing_mm};
 use super::whole::{MAX_BYTES, open};
 use regrind_core::geometry::Grid;
 
@@ -27,8 +27,11 @@ const FIELDS: [&str; 8] =
 /// SDF format, detected by its first bytes.
 pub(super) const FORMAT: MapFormat = MapFormat {
     begins: is_sdf,
-    read: |path| read_sdf(path).map(Into::into),
-    parse: |path, bytes| parse_sdf(path, bytes).map(Into::into),
+    parse: |path, bytes, given_mm| {
+        let map = parse_sdf(path, bytes)?;
+        sample_spacing_mm(path, map.heights.grid.spacing_mm, given_mm)?;
+        Ok(map.into())
+    },
 };
 
 /// Reads an SDF map of at most 1 GiB. Returns the heights on a grid, in millimetres.

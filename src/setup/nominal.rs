@@ -74,6 +74,7 @@ fn table_format(words: &TableSettings, keys: [&'static str; 3]) -> Result<format
         columns: words.columns.as_deref().map(str::parse).transpose().map_err(|what| (keys[0], what))?,
         unit: unit(&words.unit, keys[1])?,
         height_unit: unit(&words.height_unit, keys[2])?,
+        sample_spacing_mm: None,
     })
 }
 

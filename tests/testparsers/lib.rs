@@ -136,7 +136,9 @@ pub fn lens(bytes: &[u8]) -> bool {
 
 /// Maps of heights of any format.
 pub fn map(bytes: &[u8]) -> bool {
-    let Ok(points) = parse_map(path(), bytes).or_else(|_| parse_scanner_cloud(path(), bytes)) else { return false };
+    // Maps that do not state the distance of their samples are read with it.
+    let map = parse_map(path(), bytes, None).or_else(|_| parse_map(path(), bytes, Some(0.5)));
+    let Ok(points) = map.or_else(|_| parse_scanner_cloud(path(), bytes)) else { return false };
     assert_believable(&points);
     !points.is_empty()
 }
@@ -166,7 +168,7 @@ pub fn result(bytes: &[u8]) -> bool {
         (Some(Coordinates::Centres), DecimalMark::Comma, Unit::Millimetre, Some(Unit::Micrometre)),
         (Some(Coordinates::Contacts), DecimalMark::Point, Unit::Inch, None),
     ] {
-        let content = Content { coordinates, decimal, unit, height_unit, columns: None };
+        let content = Content { coordinates, decimal, unit, height_unit, ..Content::default() };
         let Ok(file) = parse_result(path(), bytes, &content) else { continue };
         is_read = true;
         assert!(file.points.iter().all(|p| p.iter().all(|v| v.abs() <= LIMIT_MM * content.unit.in_mm())));

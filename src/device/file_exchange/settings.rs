@@ -43,6 +43,9 @@ pub struct ExchangeWire {
     pub unit: Unit,
     /// Unit of length of z in a table, if it differs from that of x and y.
     pub height_unit: Option<Unit>,
+    /// Distance of the samples of a map of heights, if the map does not state it.
+    #[schemars(range(min = 1e-6, max = 100.0))]
+    pub sample_spacing_mm: Option<f64>,
     /// Columns of x, y and z in results, if their headers do not identify them: `x=NAME,y=NAME,z=NAME`, names or
     /// numbers from 1.
     #[schemars(length(min = 5, max = 200), example = &"x=X_act,y=Y_act,z=Z_act")]
@@ -86,6 +89,7 @@ impl Default for ExchangeWire {
             decimal: DecimalMark::Auto,
             unit: Unit::Millimetre,
             height_unit: None,
+            sample_spacing_mm: None,
             columns: None,
             stations: Vec::new(),
             reference_points: None,
@@ -148,6 +152,7 @@ impl DriverFactory for ExchangeWire {
                 decimal: self.decimal,
                 unit: self.unit,
                 height_unit: self.height_unit,
+                sample_spacing_mm: self.sample_spacing_mm,
                 columns: self.columns.clone(),
             },
             result: Pattern::new(&*self.result),

@@ -22,6 +22,9 @@ pub struct ManualWire {
     pub unit: Unit,
     /// Unit of length of z in a table, if it differs from that of x and y.
     pub height_unit: Option<Unit>,
+    /// Distance of the samples of a map of heights, if the map does not state it.
+    #[schemars(range(min = 1e-6, max = 100.0))]
+    pub sample_spacing_mm: Option<f64>,
     /// Columns of x, y and z in measurements, if their headers do not identify them: `x=NAME,y=NAME,z=NAME`, names or
     /// numbers from 1.
     #[schemars(length(min = 5, max = 200), example = &"x=X_act,y=Y_act,z=Z_act")]
@@ -38,6 +41,7 @@ impl Default for ManualWire {
             decimal: DecimalMark::Auto,
             unit: Unit::Millimetre,
             height_unit: None,
+            sample_spacing_mm: None,
             columns: None,
             probe_tolerance_mm: 0.001,
         }
@@ -73,6 +77,7 @@ impl ManualWire {
                 decimal: self.decimal,
                 unit: self.unit,
                 height_unit: self.height_unit,
+                sample_spacing_mm: self.sample_spacing_mm,
                 columns: self.columns.clone(),
             },
             min_free_points: context.min_free_points,

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{Bytes, map_from_top, read_with};
+use super::{Bytes, map_from_top};
 
 const MAGIC: &[u8] = b"AliconaImaging\0\r\n";
 const TAG: usize = 52;
@@ -18,11 +18,10 @@ const MAX_WHOLE: f64 = 1e15;
 /// Format of Alicona, detected by its first bytes.
 pub(in super::super) const FORMAT: MapFormat = MapFormat {
     begins: |head| head.starts_with(MAGIC),
-    read: |path| read_with(path, parse_alicona),
-    parse: |path, bytes| parse_alicona(path, bytes).map(Into::into),
+    parse: |path, bytes, given_mm| parse_alicona(path, bytes, given_mm).map(Into::into),
 };
 
-fn parse_alicona(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+fn parse_alicona(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<HeightMap, FormatError> {
     let file = Bytes { path, bytes };
     let text = |slice: &[u8]| {
         let end = slice.iter().position(|&b| b == 0).unwrap_or(slice.len());
@@ -66,5 +65,10 @@ fn parse_alicona(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
         // The mark is written with fewer digits than a number of 32 bits has.
         (value.is_finite() && value < mark * (1.0 - 1e-6)).then_some(1e3 * value)
     };
-    map_from_top(path, [columns, rows], [1e3 * number("PixelSizeXMeter")?, 1e3 * number("PixelSizeYMeter")?], height)
+    map_from_top(
+        path,
+        [columns, rows],
+        ([1e3 * number("PixelSizeXMeter")?, 1e3 * number("PixelSizeYMeter")?], given_mm),
+        height,
+    )
 }

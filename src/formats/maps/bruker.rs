@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{Bytes, checked_factor, length_mm, map_from_top, read_with};
+use super::{Bytes, checked_factor, length_mm, map_from_top};
 
 const MAGIC: &[u8] = b"VCA DATA\x01\x00\x00\x55";
 const MAX_DEPTH: usize = 32;
@@ -32,8 +32,7 @@ const USED: [&str; 8] = [
 /// Format of Bruker, detected by its first bytes.
 pub(in super::super) const FORMAT: MapFormat = MapFormat {
     begins: |head| head.starts_with(MAGIC),
-    read: |path| read_with(path, parse_bruker),
-    parse: |path, bytes| parse_bruker(path, bytes).map(Into::into),
+    parse: |path, bytes, given_mm| parse_bruker(path, bytes, given_mm).map(Into::into),
 };
 
 /// Value of an item that is used.
@@ -61,7 +60,7 @@ struct Reader<'a> {
     is_used: bool,
 }
 
-fn parse_bruker(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+fn parse_bruker(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<HeightMap, FormatError> {
     let file = Bytes { path, bytes };
     let mut reader = Reader { file, at: MAGIC.len(), items: Vec::new(), count: 0, is_used: false };
     reader.read_items("", bytes.len(), 0)?;
@@ -112,7 +111,7 @@ fn parse_bruker(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
     let pitch = |key: &str, count: usize| Ok(quantity_mm(key)? / (count - 1) as f64);
     let spacing_mm = [pitch("Dimension2Extent", columns)?, pitch("Dimension1Extent", rows)?];
     let scale_mm = quantity_mm("DataScale")?;
-    map_from_top(path, [columns, rows], spacing_mm, |index| {
+    map_from_top(path, [columns, rows], (spacing_mm, given_mm), |index| {
         let value = f64::from(file.f32(begin + 4 * index).ok()?);
         (value.abs() < 1e38).then_some(value * scale_mm)
     })

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{Bytes, checked_factor, length_mm, map_from_top, read_with};
+use super::{Bytes, checked_factor, length_mm, map_from_top};
 
 /// Places of the steps along x, y and z.
 const STEPS: [&str; 3] = ["step of x (byte 120)", "step of y (byte 124)", "step of z (byte 128)"];
@@ -20,12 +20,11 @@ const COMPRESSED: &[u8] = b"DSCOMPRESSED";
 /// Format of Digital Surf, detected by its first bytes.
 pub(in super::super) const FORMAT: MapFormat = MapFormat {
     begins: |head| head.starts_with(PLAIN) || head.starts_with(COMPRESSED),
-    read: |path| read_with(path, parse_digital_surf),
-    parse: |path, bytes| parse_digital_surf(path, bytes).map(Into::into),
+    parse: |path, bytes, given_mm| parse_digital_surf(path, bytes, given_mm).map(Into::into),
 };
 
 /// Parses the first object of a file.
-fn parse_digital_surf(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+fn parse_digital_surf(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<HeightMap, FormatError> {
     let file = Bytes { path, bytes };
     let must = |at: usize, name: &str, allowed: &[i16]| -> Result<i16, FormatError> {
         let found = file.i16(at)?;
@@ -78,7 +77,7 @@ fn parse_digital_surf(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatErro
         let is_mark = has_marks && (raw < zmin || raw > zmax);
         (!is_mark).then(|| f64::from(raw) * steps_mm[2] + offset_mm)
     };
-    map_from_top(path, [columns, rows], [steps_mm[0], steps_mm[1]], height)
+    map_from_top(path, [columns, rows], ([steps_mm[0], steps_mm[1]], given_mm), height)
 }
 
 /// Decodes a unit: Latin-1, the code page 437 or UTF-8.

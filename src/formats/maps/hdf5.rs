@@ -10,7 +10,7 @@ use hdf5_reader::{Dataset, Hdf5File, OpenOptions};
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MAX_SAMPLES, MapFormat, check_size};
 use super::hdf5_value::{Value, attribute, numbers, table};
-use super::{checked_factor, length_mm, map_from_top, read_with, unexpected};
+use super::{checked_factor, length_mm, map_from_top, unexpected};
 
 const MAGIC: &[u8] = b"\x89HDF\r\n\x1a\n";
 
@@ -26,8 +26,7 @@ const MARK: f64 = 1e37;
 /// HDF5 format, detected by its first bytes.
 pub(in super::super) const FORMAT: MapFormat = MapFormat {
     begins: |head| head.starts_with(MAGIC),
-    read: |path| read_with(path, parse_hdf5),
-    parse: |path, bytes| parse_hdf5(path, bytes).map(Into::into),
+    parse: |path, bytes, given_mm| parse_hdf5(path, bytes, given_mm).map(Into::into),
 };
 
 /// Attributes of a dataset or group, decoded when they are asked for.
@@ -38,22 +37,22 @@ struct Attributes<'a> {
     list: Vec<hdf5_reader::Attribute>,
 }
 
-fn parse_hdf5(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+fn parse_hdf5(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<HeightMap, FormatError> {
     let limit = bytes.len().saturating_mul(MAX_RATIO).min(MAX_DECODED);
     let options = OpenOptions::default().with_max_read_bytes(limit).with_max_chunk_bytes(limit);
     let file = Hdf5File::from_vec_with_options(bytes.to_vec(), options);
     let file = file.map_err(|error| unexpected(path, "file", "HDF5", error.to_string()))?;
     if file.group("/measurement0/genraw").is_ok() || file.group("/measurement0").is_ok() {
-        return four_d(path, &file, "/measurement0/genraw", "data", "wavelength");
+        return four_d(path, &file, ("/measurement0/genraw", "data", "wavelength"), given_mm);
     }
     if file.dataset("/Measurement/SurfaceInWaves/Data").is_ok() {
-        return four_d(path, &file, "/Measurement", "SurfaceInWaves/Data", "WavelengthInNanometers");
+        return four_d(path, &file, ("/Measurement", "SurfaceInWaves/Data", "WavelengthInNanometers"), given_mm);
     }
-    zygo_mx(path, &file)
+    zygo_mx(path, &file, given_mm)
 }
 
 /// Reads the surface of Zygo Mx.
-fn zygo_mx(path: &Path, file: &Hdf5File) -> Result<HeightMap, FormatError> {
+fn zygo_mx(path: &Path, file: &Hdf5File, given_mm: Option<f64>) -> Result<HeightMap, FormatError> {
     let place = surface_path(path, file)?;
     let surface = dataset(path, file, &place)?;
     let attributes = Attributes { path, file, name: place.clone(), list: surface.attributes() };
@@ -85,7 +84,8 @@ fn zygo_mx(path: &Path, file: &Hdf5File) -> Result<HeightMap, FormatError> {
     let mark = mark.min(MARK);
     // The mark is stored with the digits of the heights: 2147483640 is 2147483648 in 32 bits.
     let is_height = |value: f64| value.is_finite() && value < mark && value.abs() < MARK;
-    let mut map = map_of(path, &place, &surface, spacing_mm, |value| is_height(value).then_some(value * unit_mm))?;
+    let height = |value| is_height(value).then_some(value * unit_mm);
+    let mut map = map_of(path, &place, &surface, (spacing_mm, given_mm), height)?;
     map.notes.extend(note);
     Ok(map)
 }
@@ -122,25 +122,30 @@ fn surface_path(path: &Path, file: &Hdf5File) -> Result<String, FormatError> {
     Err(unexpected(path, "groups", "those of Zygo Mx (/Data/Surface) or of 4D (/measurement0/genraw)", "others"))
 }
 
-/// Reads a surface of 4D, in waves. Its files do not have the distance of the samples on the part.
-fn four_d(path: &Path, file: &Hdf5File, group: &str, data: &str, key: &str) -> Result<HeightMap, FormatError> {
+/// Reads a surface of 4D, in waves: the dataset `data` of `group`, whose attribute `key` has the wavelength in nm. Its
+/// files do not have the distance of the samples on the part, and do not say which row is the top one.
+fn four_d(
+    path: &Path,
+    file: &Hdf5File,
+    (group, data, key): (&str, &str, &str),
+    given_mm: Option<f64>,
+) -> Result<HeightMap, FormatError> {
     let place = format!("{group}/{data}");
-    dataset(path, file, &place)?;
+    let surface = dataset(path, file, &place)?;
     let found = file.group(group).map_err(|error| unexpected(path, group, "a group", error.to_string()))?;
     let list = found.attributes().map_err(|error| unexpected(path, group, "attributes", error.to_string()))?;
     let attributes = Attributes { path, file, name: group.to_owned(), list };
     let wavelength = attributes.get(key)?;
-    let has_wavelength = match &wavelength {
-        Some(value) => match value.text() {
-            Some(text) => text.strip_suffix("nm").is_some_and(|number| number.trim().parse::<f64>().is_ok()),
-            None => value.number().is_some(),
-        },
-        None => false,
-    };
-    if !has_wavelength {
-        return Err(unexpected(path, group, "a wavelength in nm", "none"));
-    }
-    Err(FormatError::NoLateralScale { path: path.to_owned(), found: 0.0 })
+    let wavelength_nm = wavelength.as_ref().and_then(|value| match value.text() {
+        Some(text) => text.strip_suffix("nm").and_then(|number| number.trim().parse().ok()),
+        None => value.number(),
+    });
+    let wavelength_nm = wavelength_nm.ok_or_else(|| unexpected(path, group, "a wavelength in nm", "none"))?;
+    let wave_mm = 1e-6 * checked_factor(path, &format!("{group}, {key}"), "a number of nm", wavelength_nm)?;
+    let height = |waves: f64| (waves.is_finite() && waves.abs() < MARK).then_some(waves * wave_mm);
+    let mut map = map_of(path, &place, &surface, ([0.0; 2], given_mm), height)?;
+    map.notes.push("files of 4D do not say which row is the top one; the first row is taken as the top one".to_owned());
+    Ok(map)
 }
 
 fn dataset(path: &Path, file: &Hdf5File, place: &str) -> Result<Dataset, FormatError> {
@@ -151,7 +156,7 @@ fn map_of(
     path: &Path,
     place: &str,
     surface: &Dataset,
-    spacing_mm: [f64; 2],
+    spacing_mm: ([f64; 2], Option<f64>),
     height: impl Fn(f64) -> Option<f64>,
 ) -> Result<HeightMap, FormatError> {
     let &[rows, columns] = surface.shape() else {

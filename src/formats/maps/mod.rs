@@ -17,16 +17,7 @@ use std::path::Path;
 use regrind_core::geometry::Grid;
 
 use super::error::{FormatError, excerpt};
-use super::height_map::{HeightMap, MapPoints, check_size};
-use super::whole::{MAX_BYTES, open};
-
-/// Reads a file whole, and parses it.
-pub(super) fn read_with(
-    path: &Path,
-    parse: fn(&Path, &[u8]) -> Result<HeightMap, FormatError>,
-) -> Result<MapPoints, FormatError> {
-    parse(path, &open(path)?.read_all(path, MAX_BYTES)?).map(Into::into)
-}
+use super::height_map::{HeightMap, check_size, sample_spacing_mm};
 
 /// Bytes of a file, little-endian, with its path for messages.
 #[derive(Clone, Copy)]
@@ -111,19 +102,16 @@ fn length_mm(unit: &str) -> Option<f64> {
     })
 }
 
-/// Creates the map from rows that go from the top down.
+/// Creates the map from rows that go from the top down. The distances of its samples are those that the file states, or
+/// the one that a person gives, as in [`sample_spacing_mm`].
 fn map_from_top(
     path: &Path,
     [columns, rows]: [usize; 2],
-    spacing_mm: [f64; 2],
+    (stated_mm, given_mm): ([f64; 2], Option<f64>),
     height: impl Fn(usize) -> Option<f64>,
 ) -> Result<HeightMap, FormatError> {
     check_size(path, columns as u64, rows as u64)?;
-    for pitch in spacing_mm {
-        if !(pitch > 0.0 && pitch.is_finite()) {
-            return Err(FormatError::NoLateralScale { path: path.to_owned(), found: 1e-3 * pitch });
-        }
-    }
+    let spacing_mm = sample_spacing_mm(path, stated_mm, given_mm)?;
     let samples = (0..rows).rev().flat_map(|row| (0..columns).map(move |column| row * columns + column)).map(height);
     HeightMap::new(path, Grid { columns, rows, first_mm: [0.0; 2], spacing_mm }, samples)
 }

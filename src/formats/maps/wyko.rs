@@ -7,7 +7,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{Bytes, checked_factor, map_from_top, read_with};
+use super::{Bytes, checked_factor, map_from_top};
 
 const MAGIC: &[u8] = b"\x01\x00Directory";
 const ENTRY: usize = 24;
@@ -22,8 +22,7 @@ const HEIGHTS: [&str; 5] = ["RAW_DATA", "RAW DATA", "OPD", "Raw", "SAMPLE_DATA"]
 /// Format of Wyko Vision, detected by its first bytes.
 pub(in super::super) const FORMAT: MapFormat = MapFormat {
     begins: |head| head.starts_with(MAGIC),
-    read: |path| read_with(path, parse_wyko),
-    parse: |path, bytes| parse_wyko(path, bytes).map(Into::into),
+    parse: |path, bytes, given_mm| parse_wyko(path, bytes, given_mm).map(Into::into),
 };
 
 /// Block of the file.
@@ -34,7 +33,7 @@ struct Block {
     length: usize,
 }
 
-fn parse_wyko(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+fn parse_wyko(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<HeightMap, FormatError> {
     let file = Bytes { path, bytes };
     let blocks = blocks(&file)?;
     let number = |name: &str| -> Result<Option<f64>, FormatError> {
@@ -76,7 +75,7 @@ fn parse_wyko(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
         };
         value.is_finite().then_some(value * unit_mm)
     };
-    map_from_top(path, [columns, rows], [pitch_mm, pitch_mm * aspect], height)
+    map_from_top(path, [columns, rows], ([pitch_mm, pitch_mm * aspect], given_mm), height)
 }
 
 /// Reads the directory.

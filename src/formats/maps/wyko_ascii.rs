@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{checked_factor, map_from_top, read_with, unexpected};
+use super::{checked_factor, map_from_top, unexpected};
 
 /// Names of the arrays that have heights.
 const HEIGHTS: [&str; 5] = ["RAW_DATA", "RAW DATA", "OPD", "Raw", "SAMPLE_DATA"];
@@ -17,8 +17,7 @@ const SIZE_CELL: usize = 1;
 /// ASCII format of Wyko Vision, detected by its first bytes.
 pub(in super::super) const FORMAT: MapFormat = MapFormat {
     begins: |head| head.starts_with(b"Wyko ASCII Data File"),
-    read: |path| read_with(path, parse_wyko_ascii),
-    parse: |path, bytes| parse_wyko_ascii(path, bytes).map(Into::into),
+    parse: |path, bytes, given_mm| parse_wyko_ascii(path, bytes, given_mm).map(Into::into),
 };
 
 /// Values of the header.
@@ -31,7 +30,7 @@ struct Header {
     mult: Option<f64>,
 }
 
-fn parse_wyko_ascii(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+fn parse_wyko_ascii(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<HeightMap, FormatError> {
     let text = String::from_utf8_lossy(bytes);
     let mut lines = (1usize..).zip(text.lines());
     let wrong = |line: usize, expected: &str, found: &str| unexpected(path, &format!("line {line}"), expected, found);
@@ -62,7 +61,7 @@ fn parse_wyko_ascii(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError>
             "Wavelength" => header.wavelength_nm = Some(value()?),
             "Aspect" => header.aspect = Some(value()?),
             "Mult" => header.mult = Some(value()?),
-            name if HEIGHTS.contains(&name) => return header.map(path, is_nm, lines),
+            name if HEIGHTS.contains(&name) => return header.map(path, (is_nm, given_mm), lines),
             _ => {}
         }
     }
@@ -73,7 +72,7 @@ impl Header {
     fn map<'a>(
         &self,
         path: &Path,
-        is_nm: bool,
+        (is_nm, given_mm): (bool, Option<f64>),
         lines: impl Iterator<Item = (usize, &'a str)>,
     ) -> Result<HeightMap, FormatError> {
         let missing = |name: &str| unexpected(path, "the header", &format!("a line {name}"), "none");
@@ -119,7 +118,7 @@ impl Header {
             });
         }
         let spacing_mm = [pitch_mm, pitch_mm * aspect];
-        map_from_top(path, [columns, rows], spacing_mm, |index| {
+        map_from_top(path, [columns, rows], (spacing_mm, given_mm), |index| {
             let (column, row) = (index % columns, rows - 1 - index / columns);
             values[column * rows + row].map(|value| value * unit_mm)
         })

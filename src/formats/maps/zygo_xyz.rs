@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{map_from_top, read_with, unexpected};
+use super::{map_from_top, unexpected};
 
 /// Bytes of the shortest line of a sample: three numbers of one digit, with what separates them.
 const SHORTEST_LINE: usize = "0 0 0\n".len();
@@ -13,11 +13,10 @@ const SHORTEST_LINE: usize = "0 0 0\n".len();
 /// XYZ format of Zygo, detected by its first bytes.
 pub(in super::super) const FORMAT: MapFormat = MapFormat {
     begins: |head| head.starts_with(b"Zygo XYZ Data File"),
-    read: |path| read_with(path, parse_zygo_xyz),
-    parse: |path, bytes| parse_zygo_xyz(path, bytes).map(Into::into),
+    parse: |path, bytes, given_mm| parse_zygo_xyz(path, bytes, given_mm).map(Into::into),
 };
 
-fn parse_zygo_xyz(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+fn parse_zygo_xyz(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<HeightMap, FormatError> {
     let text = String::from_utf8_lossy(bytes);
     let lines = || text.lines().map(str::trim);
     let wrong = |line: usize, expected: &str| {
@@ -83,7 +82,7 @@ fn parse_zygo_xyz(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
         let place = format!("sample {} of row {}", missing % columns + 1, missing / columns + 1);
         return Err(FormatError::Cut { path: path.to_owned(), place, expected: "a line for each sample".to_owned() });
     }
-    let mut map = map_from_top(path, [columns, rows], [pitch_mm; 2], |index| heights[index])?;
+    let mut map = map_from_top(path, [columns, rows], ([pitch_mm; 2], given_mm), |index| heights[index])?;
     map.notes.push("heights are taken in µm, as MetroPro writes them; Mx can be set to another unit".to_owned());
     Ok(map)
 }

@@ -21,7 +21,7 @@ use std::path::Path;
 use zip::ZipArchive;
 
 use super::error::{FormatError, excerpt};
-use super::height_map::{HeightMap, MapFormat, MapPoints};
+use super::height_map::{HeightMap, MapFormat, MapPoints, sample_spacing_mm};
 use super::number::is_believable;
 use super::whole::{MAX_BYTES, open};
 use document::{Axis, Extent, Main, Record, Samples, Sealed, is_sum};
@@ -49,8 +49,17 @@ pub enum X3pFile {
 /// X3P format, detected by its first bytes.
 pub(super) const FORMAT: MapFormat = MapFormat {
     begins: is_zip,
-    read: |path| read_x3p(path).map(Into::into),
-    parse: |path, bytes| parse_x3p(path, bytes).map(Into::into),
+    parse: |path, bytes, given_mm| {
+        let file = parse_x3p(path, bytes)?;
+        match (&file, given_mm) {
+            (X3pFile::Map(map), _) => {
+                sample_spacing_mm(path, map.heights.grid.spacing_mm, given_mm)?;
+            }
+            (X3pFile::Points(_), Some(_)) => return Err(FormatError::NotAMap { path: path.to_owned() }),
+            (X3pFile::Points(_), None) => {}
+        }
+        Ok(file.into())
+    },
 };
 
 impl From<X3pFile> for MapPoints {

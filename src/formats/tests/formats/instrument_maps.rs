@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use regrind_core::geometry::Point;
+use regrind_formats::result::{Content, parse_result};
 use regrind_formats::{FormatError, NotedPoints, Table, parse_map, read_measured_with_notes};
 
 fn folder() -> PathBuf {
@@ -88,6 +89,51 @@ fn maps_without_scale_or_unit_are_refused() {
     assert!(matches!(refused, FormatError::Unexpected { .. }), "{refused}");
 }
 
+#[test]
+fn maps_without_scale_take_given_spacing() {
+    let table = Table { sample_spacing_mm: Some(0.5), ..Table::default() };
+    let of_scale: Vec<&str> = REFUSED.iter().filter(|(_, why)| *why == "scale").map(|(name, _)| *name).collect();
+    assert_eq!(of_scale.len(), 4);
+    for name in of_scale {
+        let read = read_measured_with_notes(folder().join(name), &table).unwrap();
+        assert_eq!(read.points.len(), 33, "{name}");
+        let off = difference(&read.points, 0.5, false);
+        assert!(off < 1e-11, "{name}: {off:e} mm");
+        assert_eq!(read.notes.len(), usize::from(name.starts_with("4d")), "{name}");
+        let content = Content { sample_spacing_mm: Some(0.5), ..Content::default() };
+        let bytes = std::fs::read(folder().join(name)).unwrap();
+        assert_eq!(parse_result(Path::new(name), &bytes, &content).unwrap().points, read.points, "{name}");
+    }
+}
+
+#[test]
+fn given_spacing_is_refused_where_it_has_no_use() {
+    let table = Table { sample_spacing_mm: Some(0.5), ..Table::default() };
+    let content = Content { sample_spacing_mm: Some(0.5), ..Content::default() };
+    for entry in std::fs::read_dir(folder()).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_string_lossy().into_owned();
+        if read(&path).is_err() || name == "README.md" {
+            continue;
+        }
+        let bytes = std::fs::read(&path).unwrap();
+        for refused in
+            [read_measured_with_notes(&path, &table).unwrap_err(), parse_result(&path, &bytes, &content).unwrap_err()]
+        {
+            assert!(matches!(refused, FormatError::LateralScaleStated { given: 0.5, .. }), "{name}: {refused}");
+        }
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let text = folder.path().join("points.csv");
+    std::fs::write(&text, "x_mm,y_mm,z_mm\n1,2,3\n").unwrap();
+    for refused in [
+        read_measured_with_notes(&text, &table).unwrap_err(),
+        parse_result(&text, &std::fs::read(&text).unwrap(), &content).unwrap_err(),
+    ] {
+        assert!(matches!(refused, FormatError::NotAMap { .. }), "{refused}");
+    }
+}
+
 /// Returns the bytes of a fixture, in which the only occurrence of `from` is replaced by `to`.
 fn changed(name: &str, from: &[u8], to: &[u8]) -> Vec<u8> {
     let bytes = std::fs::read(folder().join(name)).unwrap();
@@ -110,7 +156,7 @@ fn replaced(bytes: &[u8], from: &[u8], to: &[u8]) -> Vec<u8> {
 /// Returns the place in the file that the error names.
 #[track_caller]
 fn refused_place(name: &str, bytes: &[u8]) -> String {
-    match parse_map(Path::new(name), bytes) {
+    match parse_map(Path::new(name), bytes, None) {
         Err(FormatError::Unexpected { place, .. }) => place,
         other => panic!("{name}: {other:?}"),
     }
@@ -183,7 +229,7 @@ fn value_of_wyko_ascii_is_in_its_cell() {
     }
     let remark = changed(name, block.as_bytes(), b"Pixel_size\t7\t4\t0.5\t7");
     let plain = std::fs::read(folder().join(name)).unwrap();
-    assert_eq!(parse_map(Path::new(name), &remark).unwrap(), parse_map(Path::new(name), &plain).unwrap());
+    assert_eq!(parse_map(Path::new(name), &remark, None).unwrap(), parse_map(Path::new(name), &plain, None).unwrap());
     for size in ["-5", "5.5", "NaN", ""] {
         let bytes = changed(name, b"Y Size\t5", format!("Y Size\t{size}").as_bytes());
         assert_eq!(refused_place(name, &bytes), "line 3", "{size:?}");
@@ -252,7 +298,7 @@ fn blocks_of_wyko_make_up_file() {
     let name = "opd-float32.opd";
     let plain = std::fs::read(folder().join(name)).unwrap();
     assert_eq!(refused_place(name, &[&plain[..], b"\0\0\0\0"].concat()), "directory");
-    let cut = parse_map(Path::new(name), &plain[..plain.len() - 1]);
+    let cut = parse_map(Path::new(name), &plain[..plain.len() - 1], None);
     assert!(matches!(cut, Err(FormatError::Cut { .. })), "{cut:?}");
     let title = |name: &str, kind: u8, length: u8| {
         let mut entry = name.as_bytes().to_vec();
@@ -266,14 +312,17 @@ fn blocks_of_wyko_make_up_file() {
     let mut misstated = changed(name, &title("Title", 5, 9), &title("ImageModificat~0", 7, 40));
     let content = misstated.windows(7).position(|part| part == b"fixture").expect("the title");
     misstated.drain(content + 4..content + 9);
-    assert_eq!(parse_map(Path::new(name), &misstated).unwrap(), parse_map(Path::new(name), &plain).unwrap());
+    assert_eq!(
+        parse_map(Path::new(name), &misstated, None).unwrap(),
+        parse_map(Path::new(name), &plain, None).unwrap()
+    );
 }
 
 /// A size in the header is held against the bytes of the file before memory is reserved for it.
 #[test]
 fn size_beyond_file_is_refused() {
     let name = "zygo-format1.xyz";
-    let refused = parse_map(Path::new(name), &changed(name, b"10 20 7 5", b"10 20 7000 7000"));
+    let refused = parse_map(Path::new(name), &changed(name, b"10 20 7 5", b"10 20 7000 7000"), None);
     assert!(matches!(&refused, Err(FormatError::Cut { place, .. }) if place == "byte 700"), "{refused:?}");
 }
 

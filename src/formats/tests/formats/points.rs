@@ -737,7 +737,7 @@ fn stated_height_unit_is_used() {
     let path = folder.path().join("table.csv");
     let read = |content: &[u8], unit: Option<Unit>, height_unit: Option<Unit>| {
         std::fs::write(&path, content).unwrap();
-        read_measured_with_notes(&path, &Table { columns: None, unit, height_unit }).map(|read| read.points)
+        read_measured_with_notes(&path, &Table { unit, height_unit, ..Table::default() }).map(|read| read.points)
     };
     let one = [Point::new(1.0, -2.0, 0.5)];
     let forms: &[&[u8]] = &[
