@@ -365,6 +365,7 @@ fn cell_file_completes_result_content() {
         decimal: DecimalMark::Comma,
         unit: regrind::formats::Unit::Inch,
         height_unit: None,
+        sample_spacing_mm: None,
         columns: None,
     };
     let mut bench = Bench::new(CmmExchange { content, ..shop.cmm() });
