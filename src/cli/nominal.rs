@@ -29,7 +29,8 @@ pub(super) struct NominalTable {
     /// Unit of z in the nominal table, if it differs from that of x and y
     #[arg(long, value_name = "UNIT")]
     nominal_height_unit: Option<Unit>,
-    /// Face of a CAD model: its number, its name, or `largest`; `regrind accuracy` lists them
+    /// Face of a CAD model: its number, its name, or `largest`; `regrind accuracy` lists them. `number:3` and `name:3`
+    /// tell a number from a name
     #[arg(long, value_name = "FACE")]
     face: Option<SurfaceChoice>,
     /// Frame of the face: that of the file, or one in its middle with z along its outward normal

@@ -21,6 +21,9 @@ pub enum ChoiceError {
     /// Several surfaces have the name.
     #[error("several have the name `{name}`; choose one by its number: {}", list(.numbers))]
     SeveralOfName { name: String, numbers: Vec<usize> },
+    /// The word is the number of one surface and the name of others.
+    #[error("{number} is a number, and the name of number {}; choose `number:{number}` or `name:{number}`", list(.named))]
+    NumberIsName { number: usize, named: Vec<usize> },
     /// The surface cannot be read.
     #[error("number {number}, {kind}, cannot be the nominal surface: {reason}")]
     Unreadable { number: usize, kind: String, reason: String },
@@ -78,6 +81,17 @@ pub(super) fn number_of(name: &str, names: &[&str]) -> Result<usize, ChoiceError
     }
 }
 
+/// Returns an error if a surface has the name `number`, but another number. `surfaces` are all numbers and names.
+pub(super) fn check_is_no_name<'a>(
+    number: usize,
+    surfaces: impl Iterator<Item = (usize, &'a str)>,
+) -> Result<(), ChoiceError> {
+    let word = number.to_string();
+    let named: Vec<usize> =
+        surfaces.filter(|(own, name)| *own != number && *name == word).map(|(own, _)| own).collect();
+    if named.is_empty() { Ok(()) } else { Err(ChoiceError::NumberIsName { number, named }) }
+}
+
 /// Maximum number of names or numbers in a message.
 const MAX_LISTED: usize = 20;
 
@@ -99,6 +113,14 @@ fn names_there(names: &[String]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn number_is_no_name_of_another() {
+        let surfaces = [(1, "2"), (2, ""), (3, "3"), (5, "2")];
+        let check = |number| check_is_no_name(number, surfaces.into_iter());
+        assert_eq!([1, 3, 4].map(check), [Ok(()), Ok(()), Ok(())]);
+        assert_eq!(check(2), Err(ChoiceError::NumberIsName { number: 2, named: vec![1, 5] }));
+    }
 
     #[test]
     fn name_must_be_there_once() {

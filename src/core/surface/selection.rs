@@ -15,6 +15,8 @@ pub enum SurfaceChoice {
     Largest,
     /// The face with this number, counted from 1, or the surface of a lens with its number in the file.
     Number(usize),
+    /// A number that was written as a word: that of a surface, if it is not the name of another one.
+    NumberOrName(usize),
     /// The only one with this name.
     Name(String),
 }
@@ -22,13 +24,18 @@ pub enum SurfaceChoice {
 impl FromStr for SurfaceChoice {
     type Err = Infallible;
 
-    /// Parses `largest`, a number or a name.
+    /// Parses `largest`, a number, a name, or `number:` or `name:` and one of them.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        Ok(match text.parse() {
-            _ if text == "largest" => Self::Largest,
-            Ok(number) => Self::Number(number),
-            Err(_) => Self::Name(text.to_owned()),
-        })
+        if text == "largest" {
+            return Ok(Self::Largest);
+        }
+        if let Some(name) = text.strip_prefix("name:") {
+            return Ok(Self::Name(name.to_owned()));
+        }
+        if let Some(Ok(number)) = text.strip_prefix("number:").map(str::parse) {
+            return Ok(Self::Number(number));
+        }
+        Ok(text.parse().map_or_else(|_| Self::Name(text.to_owned()), Self::NumberOrName))
     }
 }
 
@@ -36,7 +43,7 @@ impl fmt::Display for SurfaceChoice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Largest => f.write_str("largest"),
-            Self::Number(number) => write!(f, "{number}"),
+            Self::Number(number) | Self::NumberOrName(number) => write!(f, "{number}"),
             Self::Name(name) => f.write_str(name),
         }
     }
@@ -63,12 +70,19 @@ mod tests {
     fn choice_is_parsed_and_shown() {
         for (text, choice) in [
             ("largest", SurfaceChoice::Largest),
-            ("12", SurfaceChoice::Number(12)),
+            ("12", SurfaceChoice::NumberOrName(12)),
             ("OPTIC", SurfaceChoice::Name("OPTIC".into())),
             ("-1", SurfaceChoice::Name("-1".into())),
         ] {
             assert_eq!(text.parse(), Ok(choice.clone()));
             assert_eq!(choice.to_string(), text);
+        }
+        for (text, choice) in [
+            ("number:12", SurfaceChoice::Number(12)),
+            ("name:12", SurfaceChoice::Name("12".into())),
+            ("number:a", SurfaceChoice::Name("number:a".into())),
+        ] {
+            assert_eq!(text.parse(), Ok(choice));
         }
     }
 }

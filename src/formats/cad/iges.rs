@@ -1,8 +1,10 @@
 //! Faces of an IGES file: B-spline surfaces (128), surfaces of revolution (120), tabulated cylinders (122), planes,
 //! cylinders, cones, spheres and tori (190 to 198), bare, or with an outline (143, 144, 510).
 
-use std::collections::HashSet;
+use std::cell::RefCell;
+use std::collections::{HashMap, HashSet};
 use std::path::Path;
+use std::rc::Rc;
 
 use nalgebra::Matrix3;
 use regrind_core::geometry::{Point, Pose, Vector};
@@ -16,6 +18,12 @@ use super::iges_text::{Entry, IgesText, Parameter};
 use super::model::{CadFace, CadModel};
 use super::outline::{EdgePlaces, joined_outlines};
 
+/// Distance up to which two ends of curves are one vertex, as a share of the size of the face.
+const NEAR: f64 = 1e-4;
+
+/// Maximum number of edges between two vertices among which a seam is looked for.
+const MAX_ALIKE: usize = 16;
+
 /// Maximum depth of curves within curves and of transformations.
 const MAX_DEPTH: usize = 16;
 
@@ -26,7 +34,7 @@ const MAX_DEPTH: usize = 16;
 /// with the reason.
 pub(super) fn parse_iges(path: &Path, bytes: &[u8]) -> Result<CadModel, FormatError> {
     let text = IgesText::new(path, bytes)?;
-    let reader = Reader { text: &text, unit_mm: unit_mm(&text)? };
+    let reader = Reader { text: &text, unit_mm: unit_mm(&text)?, edge_lists: RefCell::default() };
     let used = reader.used();
     let is_free = |entry: &&Entry| {
         matches!(entry.kind, 143 | 144 | 510) || (is_surface(entry.kind) && !used.contains(&entry.number))
@@ -149,9 +157,14 @@ impl Taken<'_> {
     }
 }
 
+/// Edge of an edge list: the number of its curve, and those of the vertices at its ends.
+type ListedEdge = (u64, [u64; 2]);
+
 struct Reader<'a> {
     text: &'a IgesText<'a>,
     unit_mm: f64,
+    /// Edge lists (504) by their number. Each edge of a solid asks for its list, which would be read again each time.
+    edge_lists: RefCell<HashMap<u64, Rc<[ListedEdge]>>>,
 }
 
 impl<'a> Reader<'a> {
@@ -532,7 +545,8 @@ impl<'a> Reader<'a> {
                 return Err(taken.wrong("the outline as a curve in space", "only one in (u, v)"));
             };
             // The curve in (u, v) has no unit.
-            let flat = Reader { text: self.text, unit_mm: 1.0 }.pieces(in_parameters, 0)?;
+            let flat =
+                Reader { text: self.text, unit_mm: 1.0, edge_lists: RefCell::default() }.pieces(in_parameters, 0)?;
             let lift = |piece: Vec<Point>| piece.iter().map(|p| spline.evaluate(p.x, p.y).point).collect();
             flat.into_iter().map(|piece| lift(finer(piece))).collect()
         };
@@ -607,24 +621,40 @@ impl<'a> Reader<'a> {
 
     /// Reads an edge of an edge list (504), in the sense in which a loop passes it.
     fn edge(&self, list: u64, index: usize, forward: bool) -> Result<EdgePlaces, FormatError> {
-        let mut taken = self.parameters_of_number(list)?;
-        let count = taken.count()?;
-        if index == 0 || index > count {
-            return Err(taken.wrong(&format!("an edge from 1 to {count}"), &index.to_string()));
-        }
-        taken.numbers((index - 1).saturating_mul(5))?;
-        let curve = taken.pointer()?;
-        let mut ends = [0; 2];
-        for end in &mut ends {
-            let (vertices, at) = (taken.pointer()?, taken.count()?);
-            *end = vertices.saturating_mul(100_000_000).saturating_add(at as u64);
-        }
+        let known = self.edge_lists.borrow().get(&list).cloned();
+        let edges = match known {
+            Some(edges) => edges,
+            None => {
+                let edges = self.edge_list(list)?;
+                self.edge_lists.borrow_mut().entry(list).or_insert(edges).clone()
+            }
+        };
+        let Some(&(curve, mut ends)) = index.checked_sub(1).and_then(|at| edges.get(at)) else {
+            return Err(self.text.wrong(list, &format!("an edge from 1 to {}", edges.len()), &index.to_string()));
+        };
         let mut places = self.curve_places(curve, 0)?;
         if !forward {
             places.reverse();
             ends.reverse();
         }
         Ok(EdgePlaces { edge: list.saturating_mul(100_000_000).saturating_add(index as u64), ends, places })
+    }
+
+    /// Reads the edges of an edge list (504): the number of the curve and those of the vertices at its ends.
+    fn edge_list(&self, list: u64) -> Result<Rc<[ListedEdge]>, FormatError> {
+        let mut taken = self.parameters_of_number(list)?;
+        let count = taken.count()?;
+        let mut edges = Vec::new();
+        for _ in 0..count {
+            let curve = taken.pointer()?;
+            let mut ends = [0; 2];
+            for end in &mut ends {
+                let (vertices, at) = (taken.pointer()?, taken.count()?);
+                *end = vertices.saturating_mul(100_000_000).saturating_add(at as u64);
+            }
+            edges.push((curve, ends));
+        }
+        Ok(edges.into())
     }
 }
 
@@ -633,33 +663,54 @@ impl<'a> Reader<'a> {
 fn as_edges(pieces: Vec<Vec<Point>>) -> Vec<EdgePlaces> {
     let Some(first) = pieces.iter().flatten().next().copied() else { return Vec::new() };
     let size = pieces.iter().flatten().fold(0.0, |size: f64, p| size.max((p - first).norm()));
-    let near = |a: &Point, b: &Point| (a - b).norm() <= 1e-4 * size;
-    let mut vertices: Vec<Point> = Vec::new();
+    let near_mm = NEAR * size;
+    let near = |a: &Point, b: &Point| (a - b).norm() <= near_mm;
+    let mut vertices = Vertices { near_mm, count: 0, cells: HashMap::new() };
     let mut edges: Vec<EdgePlaces> = Vec::new();
+    let mut by_ends: HashMap<[u64; 2], Vec<usize>> = HashMap::new();
     for places in pieces.into_iter().filter(|places| places.len() > 1) {
-        let mut vertex = |p: &Point| {
-            let known = vertices.iter().position(|known| near(known, p));
-            known.unwrap_or_else(|| {
-                vertices.push(*p);
-                vertices.len() - 1
-            }) as u64
-        };
         let last = places[places.len() - 1];
-        let ends = [vertex(&places[0]), vertex(&last)];
+        let ends = [vertices.number_of(&places[0]), vertices.number_of(&last)];
         // A piece without length is a pole.
         if ends[0] == ends[1] && places.iter().all(|p| near(p, &last)) {
             continue;
         }
-        let same = edges.iter().find(|edge| {
-            let run_back = edge.ends == [ends[1], ends[0]] && ends[0] != ends[1];
+        let run_back = by_ends.get(&[ends[1], ends[0]]).filter(|_| ends[0] != ends[1]);
+        let same = run_back.into_iter().flatten().take(MAX_ALIKE).map(|&at| &edges[at]).find(|edge| {
             // An arc and its chord have the same ends, too.
-            let along = |of: &[Point], on: &[Point]| distance_from_line(&middle(of), on) <= 1e-4 * size;
-            run_back && along(&places, &edge.places) && along(&edge.places, &places)
+            let along = |of: &[Point], on: &[Point]| distance_from_line(&middle(of), on) <= near_mm;
+            along(&places, &edge.places) && along(&edge.places, &places)
         });
         let edge = same.map_or(edges.len() as u64, |edge| edge.edge);
+        by_ends.entry(ends).or_default().push(edges.len());
         edges.push(EdgePlaces { edge, ends, places });
     }
     edges
+}
+
+/// Vertices of a face, in cells of space so that those nearby are found at once.
+struct Vertices {
+    /// Distance up to which two places are one vertex.
+    near_mm: f64,
+    count: u64,
+    cells: HashMap<[i64; 3], Vec<(Point, u64)>>,
+}
+
+impl Vertices {
+    /// Returns the number of the vertex at `p`, a new one if none is near.
+    fn number_of(&mut self, p: &Point) -> u64 {
+        let cell = [0, 1, 2].map(|k| (p[k] / self.near_mm).floor() as i64);
+        let around = (0..27).map(|i| [0, 1, 2].map(|k| cell[k].saturating_add(i / [1, 3, 9][k] % 3 - 1)));
+        let is_near = |known: &Point| (known - p).norm() <= self.near_mm;
+        let known = around.filter_map(|cell| self.cells.get(&cell)).flatten().find(|(known, _)| is_near(known));
+        if let Some((_, number)) = known {
+            return *number;
+        }
+        let number = self.count;
+        self.count += 1;
+        self.cells.entry(cell).or_default().push((*p, number));
+        number
+    }
 }
 
 /// Adds places between those of a curve in (u, v), which is curved in space even where it is straight in (u, v).

@@ -5,7 +5,7 @@ use regrind_core::geometry::Pose;
 use regrind_core::surface::SurfaceChoice;
 use regrind_core::surface::parametric::Face;
 
-use super::super::choice_error::{ChoiceError, number_of};
+use super::super::choice_error::{ChoiceError, check_is_no_name, number_of};
 use super::super::error::FormatError;
 
 /// Share by which the largest face must exceed the next one. The areas are sums over small patches, with an error of
@@ -65,6 +65,10 @@ impl CadModel {
         let names: Vec<&str> = self.faces.iter().map(|face| &face.name[..]).collect();
         let number = match choice {
             Some(SurfaceChoice::Number(number)) => *number,
+            Some(SurfaceChoice::NumberOrName(number)) => {
+                check_is_no_name(*number, (1..).zip(names))?;
+                *number
+            }
             Some(SurfaceChoice::Name(name)) => number_of(name, &names)?,
             Some(SurfaceChoice::Largest) => self.largest()?,
             None => self.only_possible()?,

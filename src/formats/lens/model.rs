@@ -4,7 +4,7 @@ use regrind_core::geometry::Aperture;
 use regrind_core::surface::SurfaceChoice;
 use regrind_core::surface::analytic::{AnalyticSurface, DefinedSurface, DefinitionError, Sampling};
 
-use super::super::choice_error::{ChoiceError, number_of};
+use super::super::choice_error::{ChoiceError, check_is_no_name, number_of};
 
 /// Surface of a lens.
 ///
@@ -70,7 +70,11 @@ impl LensModel {
     /// Returns an error if there is no such surface, if several fit, or if the surface cannot be taken.
     pub fn choose(&self, choice: Option<&SurfaceChoice>) -> Result<&LensSurface, ChoiceError> {
         let found = match choice {
-            Some(SurfaceChoice::Number(number)) => {
+            Some(SurfaceChoice::Number(number) | SurfaceChoice::NumberOrName(number)) => {
+                if matches!(choice, Some(SurfaceChoice::NumberOrName(_))) {
+                    let surfaces = self.surfaces.iter().map(|surface| (surface.number, &surface.name[..]));
+                    check_is_no_name(*number, surfaces)?;
+                }
                 let numbers = || self.surfaces.iter().map(|surface| surface.number).collect();
                 let found = self.surfaces.iter().find(|surface| surface.number == *number);
                 found.ok_or_else(|| ChoiceError::NoSurface { number: *number, numbers: numbers() })?

@@ -119,7 +119,7 @@ impl TrimmedDomain {
         })
     }
 
-    /// Returns where the outlines cross the line on which the constant parameter is `line`.
+    /// Returns where the outlines cross the line on which the constant parameter is `line`, in rising order.
     fn crossings(&self, line: f64) -> Vec<f64> {
         let (k, other) = (self.constant, 1 - self.constant);
         let mut crossings = Vec::new();
@@ -134,6 +134,7 @@ impl TrimmedDomain {
                 }
             }
         }
+        crossings.sort_by(f64::total_cmp);
         crossings
     }
 
@@ -142,7 +143,7 @@ impl TrimmedDomain {
         let other = 1 - self.constant;
         // A parameter with a period names the same place in every turn: take the turn in which the outlines lie.
         let at = unwrapped(at, self.middle[other], self.period[other]);
-        let beyond = crossings.iter().filter(|crossing| at < **crossing).count();
+        let beyond = crossings.len() - crossings.partition_point(|crossing| *crossing <= at);
         self.outlines.is_empty() || (beyond % 2 == 1) != self.is_inverted
     }
 }
