@@ -81,6 +81,7 @@ pub mod simulated_cell;
 pub mod simulators;
 pub mod spec;
 pub mod transfer;
+pub mod true_form;
 pub mod truth;
 mod vector;
 pub mod wire;

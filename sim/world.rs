@@ -18,6 +18,7 @@ use crate::part::Part;
 use crate::probe::Placement;
 use crate::removal::systematic_mm;
 use crate::spec::{SpecError, WorldSpec};
+use crate::true_form::TrueForm;
 use crate::truth::{ExecutedPass, GrindEntry, WorldState, locked};
 
 /// Simulated cell. Clones share one truth.
@@ -97,6 +98,20 @@ impl World {
     pub fn deviations_mm(&self, places_mm: &[[f64; 2]]) -> Vec<f64> {
         let state = locked(&self.state);
         places_mm.iter().map(|&[x, y]| state.part.deviation_mm(x, y)).collect()
+    }
+
+    /// Returns the true form of the part at `places_mm`, positions (x, y) in mm in the model frame, relative to the level
+    /// that the last pass was commanded to. `locked` are the directions in which the part is not fitted, as in
+    /// [`TrueForm::of_samples`].
+    pub fn true_form(&self, places_mm: &[[f64; 2]], locked_directions: [bool; 6]) -> TrueForm {
+        let state = locked(&self.state);
+        let level_mm = state.history.last().map_or(0.0, |pass| pass.level_mm);
+        let sample = |&[x, y]: &[f64; 2]| {
+            let (place, normal) = (state.part.shape.point(x, y), state.part.shape.normal(x, y));
+            (place, normal, state.part.deviation_mm(x, y) - level_mm)
+        };
+        let samples: Vec<_> = places_mm.iter().map(sample).collect();
+        TrueForm::of_samples(&samples, locked_directions)
     }
 
     /// Calls the function `look` with the true part, and returns the result of `look`. The part cannot be ground during

@@ -1,9 +1,11 @@
 //! `regrind study`: simulates a recipe many times on all available workers, and summarises the results.
 
 use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::RecvTimeoutError;
+use std::time::{Duration, Instant};
 
 use clap::{Args, Subcommand};
 use regrind::figures::statistics::quantile;
@@ -20,8 +22,12 @@ use super::recipes::{files_of, is_below};
 
 /// Time between two queries of a worker while there is no job.
 const ROUND: Duration = Duration::from_secs(5);
+/// Maximum duration of a run: the lease of a job without the time to store its result.
+const MAX_RUN: Duration = Duration::from_secs(1700);
 /// Maximum number of jobs of one study.
 const MAX_JOBS: usize = 1_000_000;
+/// Maximum number of reasons of failures that are shown.
+const MAX_REASONS: usize = 10;
 /// Quantile of the normal distribution for a 95 % interval.
 const Z: f64 = 1.96;
 
@@ -285,7 +291,7 @@ fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
 
 /// Runs the recipe of `study` on a simulated cell in a separate process. `job` states the changed recipe values and the
 /// seed. Returns the summary of the run as JSON. The key `truth` of the summary contains the true PV and RMS of the
-/// simulated part in µm, or null if they are unknown. If the process leaves no run, returns the reason as text.
+/// simulated part in µm. If the run fails or is held, returns the reason as text.
 fn made_of(study: &Study, job: &LeasedRun) -> Result<Value, String> {
     let words = |error: &dyn std::fmt::Display| error.to_string();
     let place = std::env::temp_dir().join(format!("regrind-study-{:032x}", rand::random::<u128>()));
@@ -307,12 +313,81 @@ fn made_of(study: &Study, job: &LeasedRun) -> Result<Value, String> {
     let mut command = Command::new(std::env::current_exe().map_err(|error| words(&error))?);
     command.arg("run").arg(&recipe).args(["--cell", "sim", "--json", "--seed", &job.seed.to_string(), "--runs"]);
     command.arg(&runs).arg("--truth").arg(&truth).env("REGRIND_KEY", "");
-    let done = command.stdin(Stdio::null()).stdout(Stdio::null()).output().map_err(|error| words(&error))?;
+    run_to_end(command)?;
     let run = std::fs::read_dir(&runs).ok().and_then(|mut runs| Some(runs.next()?.ok()?.path()));
-    let Some(run) = run else { return Err(String::from_utf8_lossy(&done.stderr).trim_end().to_owned()) };
+    let run = run.ok_or("the run left no record")?;
     let mut told = run_overview(&run).map_err(|error| words(&error))?;
-    told["truth"] = std::fs::read(&truth).ok().and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default();
+    let truth = std::fs::read(&truth).map_err(|error| format!("the true form is not known: {error}"))?;
+    told["truth"] = serde_json::from_slice(&truth).map_err(|error| words(&error))?;
     Ok(told)
+}
+
+/// Runs the process `command` of a simulated run until the run is accepted or ends out of tolerance. Returns the reason
+/// as text if it ends otherwise. Nobody is there to resume a run that is Held, so such a run has failed too.
+fn run_to_end(mut command: Command) -> Result<(), String> {
+    let words = |error: std::io::Error| error.to_string();
+    let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().map_err(words)?;
+    let mut child = KilledOnDrop(child);
+    let (sender, lines) = std::sync::mpsc::channel();
+    let output = child.0.stdout.take().map(BufReader::new);
+    std::thread::spawn(move || {
+        output.into_iter().flat_map(BufRead::lines).map_while(Result::ok).try_for_each(|line| sender.send(line))
+    });
+    let errors = child.0.stderr.take();
+    let errors = std::thread::spawn(move || {
+        let mut text = Vec::new();
+        // A message that cannot be read is missing in the reason.
+        let _ = errors.map(|mut errors| errors.read_to_end(&mut text));
+        String::from_utf8_lossy(&text).trim_end().to_owned()
+    });
+    let began = Instant::now();
+    let mut alarm = None;
+    loop {
+        match lines.recv_timeout(MAX_RUN.saturating_sub(began.elapsed())) {
+            Ok(line) => {
+                if let Some(reason) = held_reason(&line, &mut alarm) {
+                    return Err(reason);
+                }
+            }
+            Err(RecvTimeoutError::Timeout) => {
+                return Err(format!("the run did not end within {} s", MAX_RUN.as_secs()));
+            }
+            Err(RecvTimeoutError::Disconnected) => break,
+        }
+    }
+    let ended = child.0.wait().map_err(words)?;
+    if matches!(ended.code(), Some(0 | 1)) {
+        return Ok(());
+    }
+    let reason = errors.join().unwrap_or_default();
+    let reason = if reason.is_empty() { alarm.unwrap_or_default() } else { reason };
+    Err(if reason.is_empty() { format!("the run ended with {ended}") } else { reason })
+}
+
+/// Returns why a run waits for a person, if `line` of its output says so. `alarm` keeps the last alarm that a person
+/// must acknowledge.
+fn held_reason(line: &str, alarm: &mut Option<String>) -> Option<String> {
+    let notice: Value = serde_json::from_str(line).ok()?;
+    let text = |key: &str| notice[key].as_str();
+    match text("notice")? {
+        "alarm" if text("clears") == Some("operator") => *alarm = text("what").map(ToOwned::to_owned),
+        "state" if text("state")?.starts_with("Held") => {
+            return alarm.take().map(|alarm| format!("the run was held: {alarm}"));
+        }
+        _ => {}
+    }
+    None
+}
+
+/// Process that does not outlive the function that started it. It is simulated whole, and its folder is deleted.
+struct KilledOnDrop(Child);
+
+impl Drop for KilledOnDrop {
+    fn drop(&mut self) {
+        // It may have ended already.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
 }
 
 fn write(path: &Path, content: &[u8]) -> Result<(), String> {
@@ -364,7 +439,22 @@ fn in_words(jobs: &[Value]) -> String {
     for (_, (_, jobs)) in &sets {
         text += &line_of(jobs);
     }
-    text
+    text + &failures_in_words(jobs)
+}
+
+/// Returns the reasons of failed jobs, one line each, with the number of jobs and one of them. Most frequent first.
+fn failures_in_words(jobs: &[Value]) -> String {
+    let mut reasons: BTreeMap<&str, Vec<&Value>> = BTreeMap::new();
+    for job in jobs.iter().filter(|job| job["state"] == "failed") {
+        let reason = job["result"]["error"].as_str().unwrap_or("the reason is not known");
+        reasons.entry(reason.lines().next().unwrap_or_default()).or_default().push(job);
+    }
+    let mut reasons: Vec<(&str, Vec<&Value>)> = reasons.into_iter().collect();
+    reasons.sort_by_key(|(_, jobs)| std::cmp::Reverse(jobs.len()));
+    let line = |(reason, jobs): &(&str, Vec<&Value>)| {
+        format!("failed: {}, such as seed {}: {reason}\n", jobs.len(), jobs[0]["seed"])
+    };
+    reasons.iter().take(MAX_REASONS).map(line).collect()
 }
 
 fn line_of(jobs: &[&Value]) -> String {

@@ -90,3 +90,41 @@ fn study_runs_match_their_seeds() {
     plant.ends(&["study", "stop", "limits", "--plant", "planner.toml"], 1);
     plant.ends(&["study", "show", "none", "--plant", "planner.toml"], 1);
 }
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn failed_runs_are_failed_with_their_reason() {
+    let plant = Plant::new();
+    plant.somebody("planner", "planner");
+    plant.somebody("farm-1", "worker");
+    let recipe = plant.path("a-mirror-with-a-name-of-many-letters.toml");
+    std::fs::rename(small_recipe(plant.home.path(), 1000.0), &recipe).unwrap();
+    // The wheel is set too low, so the part ends below the nominal surface. In one run of the two there is no part.
+    let told = plant.does(&[
+        "study",
+        "begin",
+        recipe.to_str().unwrap(),
+        "--name",
+        "limits",
+        "--seeds",
+        "7..7",
+        "--vary",
+        "simulation.faults.no_part=false,true",
+        "--vary",
+        "simulation.grinder.setting_error_z_um=-40.0",
+        "--plant",
+        "planner.toml",
+    ]);
+    assert!(told.starts_with("limits: 2 jobs"), "{told}");
+    plant.does(&["study", "work", "--plant", "farm-1.toml", "--workers", "2"]);
+    let jobs = jobs(&plant);
+    let [made, failed] = [&jobs[0], &jobs[1]];
+    assert_eq!((made["state"].as_str(), failed["state"].as_str()), (Some("done"), Some("failed")), "{jobs:#?}");
+    let last = made["result"]["cycles"].as_array().unwrap().last().unwrap();
+    let [is, seen, u] = [&made["result"]["truth"]["rms_um"], &last["rms_um"], &last["rms_u_um"]].map(Value::as_f64);
+    assert!((is.unwrap() - seen.unwrap()).abs() < 3.0 * u.unwrap(), "{jobs:#?}");
+    assert!(failed["result"]["error"].as_str().unwrap().starts_with("the run was held: "), "{jobs:#?}");
+    let told = plant.does(&["study", "show", "limits", "--plant", "planner.toml"]);
+    let lines: Vec<&str> = told.lines().collect();
+    assert!(lines.len() == 4 && lines[3].starts_with("failed: 1, such as seed 7: the run was held: "), "{told}");
+}
