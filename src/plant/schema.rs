@@ -6,13 +6,14 @@ use super::error::{PlantError, refused};
 use super::link::DatabaseLink;
 
 /// All versions of the layout, each as a migration from the one before. A published migration never changes.
-const MIGRATIONS: [(i32, &str); 6] = [
+const MIGRATIONS: [(i32, &str); 7] = [
     (1, include_str!("migrations/0001_records.sql")),
     (2, include_str!("migrations/0002_work.sql")),
     (3, include_str!("migrations/0003_views.sql")),
     (4, include_str!("migrations/0004_studies.sql")),
     (5, include_str!("migrations/0005_page.sql")),
     (6, include_str!("migrations/0006_knowledge.sql")),
+    (7, include_str!("migrations/0007_yield.sql")),
 ];
 
 /// Groups of roles. Each role that signs in is a member of one group.

@@ -76,7 +76,7 @@ async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<Pa
     Ok(PageContent { title: "Cells".into(), again_s: None, main })
 }
 
-/// Reads the newest ended runs that match `selection`, at most `PARTS` runs for each cell. The cells are sorted by
+/// Reads the newest runs that ended, or whose part was given up, and that match `selection`, at most `PARTS` runs for each cell. The cells are sorted by
 /// name. The first `after` cells are skipped. Retired cells are not included. Returns at most `CELLS` + 1 cells. A page
 /// shows only `CELLS` cells; if there is one more, the caller knows that a next page exists. The PV values of each cell
 /// are sorted in ascending order.
@@ -85,8 +85,8 @@ async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Resul
     let n = values.len();
     // Reads one cell at a time, each from the end of its own index.
     let text = format!(
-        "SELECT c.name, p.pv_um, p.cycles, p.result FROM (SELECT name FROM cell WHERE retired_at IS NULL ORDER BY name LIMIT ${} OFFSET ${}) c
-            LEFT JOIN LATERAL (SELECT pv_um, cycles, result FROM part_run WHERE cell = c.name AND ended IS NOT NULL AND {condition}
+        "SELECT c.name, p.pv_um, p.cycles, p.result, p.given_up FROM (SELECT name FROM cell WHERE retired_at IS NULL ORDER BY name LIMIT ${} OFFSET ${}) c
+            LEFT JOIN LATERAL (SELECT pv_um, cycles, result, given_up FROM part_run WHERE cell = c.name AND (ended IS NOT NULL OR given_up) AND {condition}
                 ORDER BY began DESC LIMIT {PARTS}) p ON true ORDER BY c.name",
         n + 1,
         n + 2
@@ -102,12 +102,17 @@ async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Resul
         }
         let Some(cell) = cells.last_mut() else { continue };
         let (cycles, result): (Option<i32>, Option<&str>) = (row.get(2), row.get(3));
-        let Some(result) = result.filter(|result| *result != "open") else { continue };
+        let given_up = row.get::<_, Option<bool>>(4) == Some(true);
+        let Some(result) = result.or(given_up.then_some("open")).filter(|result| *result != "open" || given_up) else {
+            continue;
+        };
         cell.ended += 1;
+        // The figures of an unfinished part say nothing of the cell.
+        let is_finished = matches!(result, "accepted" | "not accepted");
         cell.accepted += i64::from(result == "accepted");
         cell.at_once += i64::from(result == "accepted" && cycles == Some(1));
-        cell.cycles.extend(cycles);
-        cell.pv_um.extend(row.get::<_, Option<f64>>(1).filter(|um| um.is_finite()));
+        cell.cycles.extend(cycles.filter(|_| is_finished));
+        cell.pv_um.extend(row.get::<_, Option<f64>>(1).filter(|um| is_finished && um.is_finite()));
     }
     for cell in &mut cells {
         cell.pv_um.sort_by(f64::total_cmp);

@@ -20,7 +20,7 @@ use super::trend::parts;
 const MAX_PARTS: i64 = 20_000;
 
 /// Columns of the file, in order: those of the view `part_run`.
-const COLUMNS: [&str; 26] = [
+const COLUMNS: [&str; 27] = [
     "id",
     "cell",
     "run",
@@ -47,10 +47,12 @@ const COLUMNS: [&str; 26] = [
     "probe",
     "alarms",
     "head",
+    "given_up",
 ];
 /// Columns that contain numbers or words of this program. All other columns can contain any text.
-const NUMBERS: [&str; 11] = [
+const NUMBERS: [&str; 12] = [
     "id",
+    "given_up",
     "simulation",
     "cycles",
     "pv_um",

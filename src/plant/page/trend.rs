@@ -9,7 +9,7 @@ use regrind_page::Session;
 use super::super::error::PlantError;
 use super::super::link::DatabaseLink;
 use super::content::{PageContent, page};
-use super::control_chart::{ENOUGH, Limits, Value, individuals, moving_ranges};
+use super::control_chart::{ENOUGH, Limits, Value, individuals, moving_ranges, ranges};
 use super::page_error::PageError;
 use super::selection::{ALL_KINDS, Selection, SelectionQuery, mark};
 use super::shared::Shared;
@@ -18,6 +18,9 @@ use super::words::{shown, um};
 /// Maximum number of parts in a chart, and of parts in the list of those out of limits.
 const MAX_PARTS: i64 = 250;
 const LISTED: usize = 20;
+
+/// Condition on `part_run` that a part was judged for good.
+const FINISHED: &str = "result IN ('accepted', 'not accepted') AND ";
 
 /// Part with its two figures.
 pub(super) struct Part {
@@ -57,12 +60,13 @@ async fn made(plant: &Shared, asked: &SelectionQuery) -> Result<PageContent, Pag
 }
 
 /// Reads the `most` newest parts of a selection, by the start of their run. Returns the parts from the oldest to the
-/// newest. Omits a part without a finite PV.
+/// newest. Omits a part without a finite PV. Where the last measurement is asked for, a part counts only if it was judged
+/// for good: the figures of a run that is under way, was stopped or broke off are those of an unfinished part.
 pub(super) async fn parts(link: &DatabaseLink, selection: &Selection, most: i64) -> Result<Vec<Part>, PlantError> {
     let (condition, values) = selection.condition();
     // The two views have different names for the id of the run.
     let (view, id) = if selection.first { ("cycle_figure", "run_id") } else { ("part_run", "id") };
-    let first = if selection.first { "cycle = 1 AND " } else { "" };
+    let first = if selection.first { "cycle = 1 AND " } else { FINISHED };
     let text = format!(
         "SELECT {id}, serial, cell, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), pv_um, pv_u_um, pv_limit_um, rms_um, rms_u_um, rms_limit_um
             FROM {view} WHERE {first}pv_um IS NOT NULL AND {condition} ORDER BY began DESC LIMIT {most}"
@@ -106,6 +110,13 @@ fn figure(name: &str, class: &str, values: &[Value]) -> Markup {
     let all: Vec<f64> = values.iter().map(|value| value.um).collect();
     let Some(limits) = Limits::from_values(&all) else { return Markup::default() };
     let out: Vec<&Value> = values.iter().rev().filter(|value| limits.is_out(value.um)).collect();
+    let ranges_out: Vec<&Value> = ranges(&all)
+        .iter()
+        .zip(&values[1..])
+        .rev()
+        .filter(|(range, _)| **range > limits.range_upper)
+        .map(|(_, value)| value)
+        .collect();
     let over = values.iter().filter(|value| value.limit_um.is_some_and(|limit| value.um > limit)).count();
     html! {
         section data-figure=(name) {
@@ -121,13 +132,25 @@ fn figure(name: &str, class: &str, values: &[Value]) -> Markup {
                 (over) " of " (values.len()) " above what is allowed; " (out.len()) " out of limits"
                 @if !out.is_empty() { ", the newest first:" } @else { "." }
             }
-            @if !out.is_empty() {
-                ul .out {
-                    @for value in out.iter().take(LISTED) {
-                        li {
-                            a href=(format!("/runs/{}", value.run)) { (shown(&value.serial)) } " " (value.when) ", " (shown(&value.cell)) ": "
-                            (format!("{:.3}", value.um)) " µm" @if let Some(u) = value.u_um { (format!(" ± {u:.3} µm")) }
-                        }
+            (list(&out))
+            p {
+                (ranges_out.len()) " of " (values.len() - 1) " ranges above their limit"
+                @if !ranges_out.is_empty() { ", with the part after the step, the newest first:" } @else { "." }
+            }
+            (list(&ranges_out))
+        }
+    }
+}
+
+/// Renders a list of the first parts of `values`, with links to their runs.
+fn list(values: &[&Value]) -> Markup {
+    html! {
+        @if !values.is_empty() {
+            ul .out {
+                @for value in values.iter().take(LISTED) {
+                    li {
+                        a href=(format!("/runs/{}", value.run)) { (shown(&value.serial)) } " " (value.when) ", " (shown(&value.cell)) ": "
+                        (format!("{:.3}", value.um)) " µm" @if let Some(u) = value.u_um { (format!(" ± {u:.3} µm")) }
                     }
                 }
             }

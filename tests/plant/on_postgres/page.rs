@@ -183,6 +183,16 @@ fn overview_shows_cells_and_yield() {
     runs.push(Planted { cell: three, recipe: "lens", ..of("not accepted", 2) });
     plant_runs(&plant, &runs);
     plant.sql("INSERT INTO recipe (sha256, name, version, text) VALUES (recipe_sha256('mirror', 3, 'a', '{}'), 'mirror', 3, 'a')");
+    // Three parts were given up: one whose run broke off, one of whose run nothing arrived, and one whose run ended.
+    let ended = "SELECT name FROM run WHERE cell = 3 AND result = 'not accepted'";
+    plant_runs(&plant, &[Planted { cell: three, recipe: "prism", ..of("open", 1) }]);
+    plant.sql("UPDATE run SET ended = NULL WHERE result = 'open'");
+    for run in ["SELECT name FROM run WHERE cell = 3 AND result = 'open'", "SELECT 'nothing-arrived'", ended] {
+        plant.sql(&format!(
+            "WITH made AS (INSERT INTO work (serial, recipe, state, cell, run) SELECT 'SN-UP', sha256, 'ended', 3, ({run}) FROM recipe RETURNING id)
+             INSERT INTO work_step (work, step, words) SELECT id, 'given up', 'the wheel broke' FROM made"
+        ));
+    }
     plant.sql("INSERT INTO work (serial, recipe, due) SELECT 'SN-0099', sha256, current_date - 3 FROM recipe");
     plant.sql("INSERT INTO incident (cell, run, what, words) VALUES (2, 'run-7', 'a broken chain', 'record 12 does not follow')");
 
@@ -204,9 +214,13 @@ fn overview_shows_cells_and_yield() {
     }
     assert!(said.contains("cell-3 no report yet"), "{said}");
     // Ten ended, seven were accepted, five of these after one pass: 24 to 76 % by Wilson.
-    assert!(said.contains("mirror 10 7 70 % 50 % 24 – 76 %") && said.contains("lens 1 0 0 % 0 %"), "{said}");
-    assert!(said.contains("cell-1 10 7 70 % 50 %") && said.contains("cell-3 1 0 0 %"), "{said}");
+    // The part of whose run nothing arrived counts by the recipe of the queue.
+    assert!(said.contains("mirror 11 7 64 % 45 %") && said.contains("lens 1 0 0 % 0 %"), "{said}");
+    assert!(said.contains("prism 1 0 0 % 0 %"), "{said}");
+    assert!(said.contains("cell-1 10 7 70 % 50 % 24 – 76 %") && said.contains("cell-3 3 0 0 %"), "{said}");
     assert!(html.contains("11 ended, 7 accepted, 5"), "the bar of the day");
+    let compared = words(&shown.text("/cells?recipe="));
+    assert!(compared.contains("cell-3 2 4.0") && compared.contains("0 %"), "{compared}");
     assert!(
         said.contains("SN-0099 mirror v3 any") && said.contains("late") && said.contains("a broken chain record 12"),
         "{said}"
@@ -237,6 +251,10 @@ fn trend_control_limits_and_export() {
     runs.push(Planted { cell: two, recipe: "lens", pv_um: 900.0, hours: 200, ..Planted::default() });
     runs.push(Planted { cell: one, pv_um: 900.0, real: false, ..Planted::default() });
     runs.push(Planted { cell: one, pv_um: 900.0, hours: 24 * 100, ..Planted::default() });
+    // Parts that nobody judged for good.
+    for result in ["open", "stopped", "aborted"] {
+        runs.push(Planted { cell: one, pv_um: 900.0, hours: 95, cycles: 2, result, ..Planted::default() });
+    }
     let first = plant_runs(&plant, &runs);
     let shown = ServedPage::serve(&plant);
     let html = shown.text("/trend");
@@ -255,6 +273,7 @@ fn trend_control_limits_and_export() {
     }
     assert!(!said.contains("900.000") && html.contains(&format!("href=\"/runs/{first}\"")), "{said}");
     // The first measurement is 10 um above the one after the first correction.
+    plant.sql("DELETE FROM cycle WHERE run IN (SELECT id FROM run WHERE result IN ('open', 'stopped', 'aborted'))");
     let said = words(&shown.text("/trend?at=first&cell=cell-1&recipe=mirror"));
     assert!(said.contains("mean 60.810 µm") && said.contains("55.815 and 65.805 µm"), "{said}");
     let said = words(&shown.text("/trend?recipe=lens"));
@@ -272,13 +291,17 @@ fn trend_control_limits_and_export() {
     let html = shown.text("/trend");
     let said = words(&html);
     assert!(html.contains("class=\"out\""), "{said}");
-    for piece in ["; 1 out of limits", "first: SN-OUT"] {
+    for piece in [
+        "; 1 out of limits",
+        "first: SN-OUT",
+        "1 of 10 ranges above their limit, with the part after the step, the newest first: SN-OUT",
+    ] {
         assert!(said.contains(piece), "{piece}: {said}");
     }
 
     let csv = shown.text("/export.csv?recipe=mirror");
     let lines: Vec<&str> = csv.lines().collect();
-    assert!(lines[0].starts_with("id,cell,run,serial,") && lines.len() == 12, "{csv}");
+    assert!(lines[0].starts_with("id,cell,run,serial,") && lines.len() == 15, "{csv}");
     assert!(lines[1].contains("\"SN-OUT\"") && lines[2].contains(",52.1,0.4,7,"), "{csv}");
     let answer = shown.visitor.get("/trend.dfq?recipe=mirror");
     assert!(answer.header("content-disposition")[0].contains("parts.dfq"), "{answer:?}");
