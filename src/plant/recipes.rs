@@ -4,7 +4,7 @@
 //! hash, which nobody has signed. The cell verifies hash and signatures with the keys in its own plant file, so a
 //! changed database cannot make it grind another recipe.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use data_encoding::HEXLOWER;
 use regrind_journal::{AuditKey, PublicKey, sha256_hex};
@@ -41,7 +41,51 @@ pub struct Approval {
     pub signature: String,
 }
 
+impl Approval {
+    /// Returns true if the key made the signature for this person and the recipe with the hash `sha256`. This does not
+    /// prove whose key it is: a cell knows that from its plant file.
+    pub fn is_valid(&self, sha256: &str) -> bool {
+        let key: Option<PublicKey> = self.key.parse().ok();
+        key.is_some_and(|key| key.has_signed(words(sha256, &self.person).as_bytes(), &self.signature))
+    }
+
+    /// Reads the signatures on the recipe with the hash `sha256` from the plant, in the order of their times. The
+    /// database role must be that of a planner or a reader.
+    ///
+    /// # Errors
+    /// Fails if the plant cannot be reached or refuses the query.
+    pub async fn of_recipe(link: &DatabaseLink, sha256: &str) -> Result<Vec<Self>, PlantError> {
+        let bytes = HEXLOWER.decode(sha256.as_bytes()).unwrap_or_default();
+        let text = "SELECT person, key, signature FROM approval WHERE recipe = $1 ORDER BY at, person";
+        let rows = link.client().query(text, &[&bytes]).await.map_err(refused("the signatures of a recipe"))?;
+        Ok(rows.iter().map(|row| Self { person: row.get(0), key: row.get(1), signature: row.get(2) }).collect())
+    }
+}
+
 impl PlantRecipe {
+    /// Checks that enough people have signed the recipe, with valid signatures, different names and different keys.
+    ///
+    /// # Errors
+    /// Fails if too few have signed, or if the plant cannot be reached or refuses the query.
+    pub async fn check_signatures(&self, link: &DatabaseLink) -> Result<(), PlantError> {
+        let sha256 = self.sha256();
+        let mut valid = Approval::of_recipe(link, &sha256).await?;
+        let stored = valid.len();
+        valid.retain(|approval| approval.is_valid(&sha256));
+        let wrong = stored - valid.len();
+        let names: BTreeSet<&str> = valid.iter().map(|approval| &approval.person[..]).collect();
+        let keys: BTreeSet<&str> = valid.iter().map(|approval| &approval.key[..]).collect();
+        let signers = names.len().min(keys.len());
+        if signers >= SIGNERS {
+            return Ok(());
+        }
+        let Self { name, version, .. } = self;
+        let wrong = if wrong == 0 { String::new() } else { format!(", and {wrong} wrong") };
+        Err(PlantError::Recipe(format!(
+            "version {version} of {name} has {signers} of the {SIGNERS} required signatures{wrong}: regrind plant approve"
+        )))
+    }
+
     /// Returns the SHA-256 of the recipe in hexadecimal digits. This hash identifies the recipe, and people sign it. It
     /// is computed from these lines:
     ///
@@ -198,12 +242,7 @@ fn proven(
         ));
     }
     let has_signed = |approver: &&Approver| {
-        let key: Option<PublicKey> = approver.key.parse().ok();
-        approvals.iter().any(|of| {
-            of.person == approver.name
-                && of.key == approver.key
-                && key.is_some_and(|key| key.has_signed(words(sha256, &of.person).as_bytes(), &of.signature))
-        })
+        approvals.iter().any(|of| of.person == approver.name && of.key == approver.key && of.is_valid(sha256))
     };
     let mut signed: Vec<&Approver> = approvers.iter().filter(has_signed).collect();
     // Two names with one key count as one person; so does one name with two keys.

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use regrind::formats::ScratchFolder;
 use regrind::journal::PublicKey;
-use regrind_plant::PlantRun;
+use regrind_plant::{PlantError, PlantRun, Reported, run_overview};
 use serde_json::{Value, json};
 
 use super::super::Outcome;
@@ -76,6 +76,11 @@ fn prove(plant: &Path, run: Option<&Path>, keys: &[PublicKey], json: bool) -> Re
         let copy = scratch.path().join(&found.name);
         found.fetch(&link, config.artefacts.as_ref(), &copy).await?;
         let proven = found.prove(&copy, keys)?;
+        let differences = Reported::read(&link, found.id).await?.differences(&run_overview(&copy)?);
+        if !differences.is_empty() {
+            let what = format!("what the cell reported is not what its record says: {}", differences.join("; "));
+            return Err(PlantError::Differs { run: found.name, what }.into());
+        }
         if let Some(folder) = &folder {
             found.check_local_journal(folder)?;
         }

@@ -78,6 +78,7 @@ pub(super) fn queue(arguments: &ToQueue) -> Result<Outcome, Failure> {
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
         let recipe = PlantRecipe::find(&link, &arguments.recipe, arguments.version).await?;
+        recipe.check_signatures(&link).await?;
         let (sha256, due) = (recipe.sha256(), arguments.due.map(|due| due.to_string()));
         let text = "SELECT queue_work(s, decode($2, 'hex'), $3, $4::text::date) FROM unnest($1::text[]) AS s";
         // All parts are queued, or none.

@@ -6,7 +6,7 @@ use std::path::{Component, Path, PathBuf};
 use clap::Args;
 use regrind::journal::AuditKey;
 use regrind::recipe::Recipe;
-use regrind_plant::{PlantError, PlantRecipe};
+use regrind_plant::{Approval, PlantError, PlantRecipe};
 use serde_json::json;
 
 use super::super::failure::Failure;
@@ -202,23 +202,29 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
         let text = "SELECT name, version, encode(sha256, 'hex'), to_char(proposed_at, 'YYYY-MM-DD HH24:MI:SS'), proposed_by::text,
-                array(SELECT person FROM approval a WHERE a.recipe = r.sha256 ORDER BY at), withdrawn_why
-            FROM recipe r ORDER BY name, version DESC";
+                withdrawn_why FROM recipe r ORDER BY name, version DESC";
         let found = link.query(text, &[]).await?;
         let mut told = Vec::new();
         let mut lines = String::new();
         for row in &found {
             let [name, sha256, at, by]: [&str; 4] = [row.get(0), row.get(2), row.get(3), row.get(4)];
-            let (version, signed, withdrawn): (i32, Vec<&str>, Option<&str>) = (row.get(1), row.get(5), row.get(6));
+            let (version, withdrawn): (i32, Option<&str>) = (row.get(1), row.get(5));
+            let (signed, wrong): (Vec<Approval>, Vec<Approval>) =
+                Approval::of_recipe(&link, sha256).await?.into_iter().partition(|approval| approval.is_valid(sha256));
+            let [signed, wrong] =
+                [signed, wrong].map(|all| all.into_iter().map(|of| of.person).collect::<Vec<String>>());
             told.push(json!({
                 "name": name, "version": version, "sha256": sha256, "proposed_at": at, "proposed_by": by, "signed_by": signed,
-                "withdrawn": withdrawn,
+                "wrong_signatures": wrong, "withdrawn": withdrawn,
             }));
-            let state = match (withdrawn, signed.len()) {
+            let mut state = match (withdrawn, signed.len()) {
                 (Some(reason), _) => format!("withdrawn: {reason}"),
                 (None, 0) => "not signed yet".to_owned(),
                 (None, _) => format!("signed by {}", signed.join(", ")),
             };
+            if !wrong.is_empty() {
+                state += &format!("; WRONG SIGNATURE of {}", wrong.join(", "));
+            }
             lines += &format!("{name:<24}  {version:>3}  {at}  {}  {state}\n", &sha256[..12]);
         }
         match arguments.json {

@@ -12,6 +12,8 @@ use tokio::task::spawn_blocking;
 
 use super::super::copy::PlantRun;
 use super::super::error::{PlantError, refused};
+use super::super::replication::run_overview;
+use super::super::reported::Reported;
 use super::proofs::Proof;
 use super::shared::PlantPage;
 
@@ -51,6 +53,7 @@ async fn prove(plant: &PlantPage, cell: &str, name: &str) -> Result<Proof, Plant
     let link = plant.pool.open().await?;
     link.client().batch_execute(ANSWER).await.map_err(refused("to wait longer"))?;
     let run = PlantRun::find(&link, Some(cell), name).await?;
+    let reported = Reported::read(&link, run.id).await?;
     let scratch = Arc::new(ScratchFolder::at(std::env::temp_dir().join(format!("regrind-page-{}", random_word()?)))?);
     // The name of a run comes from a cell, so it is not used as the name of a folder.
     let folder = scratch.path().join("run");
@@ -63,9 +66,12 @@ async fn prove(plant: &PlantPage, cell: &str, name: &str) -> Result<Proof, Plant
         let _kept_until_here = Arc::clone(&scratch);
         let found = run.prove(&folder, &[]).map_err(|error| without(&folder, &error.to_string()));
         let words = |error: ReportError| without(&folder, &error.to_string());
+        // Without an overview of the copy nothing can be compared, and the reason is that of the report.
+        let overview = run_overview(&folder).unwrap_or_default();
         Proof {
             at: now(),
             keys: run.keys.len(),
+            differences: reported.differences(&overview),
             report: run_report(&folder, &ReportOptions::default()).map_err(words),
             qif: run_results(&folder, ResultsFormat::Qif).map_err(words),
             dfq: run_results(&folder, ResultsFormat::Dfq).map_err(words),
@@ -81,7 +87,8 @@ impl Proof {
     fn failed(run: &PlantRun, reason: &str) -> Self {
         let reason = reason.to_owned();
         let none = || Err(reason.clone());
-        Self { at: now(), outcome: Err(reason.clone()), keys: run.keys.len(), report: none(), qif: none(), dfq: none() }
+        let (outcome, differences) = (Err(reason.clone()), Vec::new());
+        Self { at: now(), outcome, keys: run.keys.len(), differences, report: none(), qif: none(), dfq: none() }
     }
 }
 

@@ -20,10 +20,22 @@ pub(super) struct Proof {
     pub(super) outcome: Result<Verified, String>,
     /// Number of keys that the plant has for the cell.
     pub(super) keys: usize,
+    /// Figures that the cell reported and that differ from those of the copy.
+    pub(super) differences: Vec<String>,
     /// Report of the run, and its results as QIF and as DFQ; otherwise a text why there are none.
     pub(super) report: Result<String, String>,
     pub(super) qif: Result<String, String>,
     pub(super) dfq: Result<String, String>,
+}
+
+impl Proof {
+    /// Returns true if a key that is enrolled for the cell signed the copy to its end. Nobody but the cell can then have
+    /// written it. A copy without this can still be unbroken.
+    pub(super) fn is_signed_to_end(&self) -> bool {
+        let is_signed =
+            |found: &Verified| found.closed && found.signed > 0 && !found.keys.is_empty() && !found.lacks_last_seal();
+        self.keys > 0 && self.outcome.as_ref().is_ok_and(is_signed)
+    }
 }
 
 type Known = HashMap<i32, (Instant, String, Arc<Proof>)>;

@@ -164,11 +164,17 @@ fn proof_text(proof: Option<&Proof>) -> Markup {
     html! {
         @match &proof.outcome {
             Ok(found) => {
-                p .proven { strong { "Proven" } " at " (proof.at) " UTC: " (found.records) " records in an unbroken chain and " (found.artefacts) " unchanged files"
-                    @if found.signed == 0 { "; not signed" }
+                p .proven[proof.is_signed_to_end()] {
+                    strong { @if proof.is_signed_to_end() { "Proven" } @else { "Unbroken, but not proven" } }
+                    " at " (proof.at) " UTC: " (found.records) " records in an unbroken chain and " (found.artefacts) " unchanged files"
+                    @if found.signed == 0 { "; not signed, so whoever can write into the plant can have made them" }
                     @else if proof.keys == 0 { "; signatures up to record " (found.signed) ", with a key that is not enrolled at the plant" }
-                    @else { "; signatures up to record " (found.signed) ", with a key that is enrolled for the cell" }
+                    @else if proof.is_signed_to_end() { "; signed to the end, with a key that is enrolled for the cell" }
+                    @else { "; signatures up to record " (found.signed) " only, with a key that is enrolled for the cell: nothing proves the records after it" }
                     @if found.closed { "." } @else { ". The run has no recorded end: it is still active, or its record was cut before the end arrived." }
+                }
+                @if !proof.differences.is_empty() {
+                    p .no role="alert" { strong { "The report of the cell differs from the record" } ": " (shown(&proof.differences.join("; "))) }
                 }
             }
             Err(reason) => {

@@ -449,13 +449,40 @@ fn unproven_run_gives_no_report() {
         }
     }
     plant.sql("UPDATE record SET text = replace(text, 'Eve', 'Ada') WHERE seq = 1");
+    // Somebody with the password of the cell reports a better figure than the record has.
+    let was = plant.sql("SELECT pv_um FROM cycle WHERE cycle = 1");
+    plant.sql("UPDATE cycle SET pv_um = 0.5 WHERE cycle = 1");
+    {
+        let said = words(&until_proven(&ServedPage::serve(&plant), "/runs/1"));
+        assert!(said.contains("The report of the cell differs") && said.contains("pv_um of cycle 1 is 0.5"), "{said}");
+        let run = folder.display().to_string();
+        let (_, told) = plant.ends(&["audit", "verify", &run, "--plant", "cell-1.toml"], 1);
+        assert!(told.contains("pv_um of cycle 1"), "{told}");
+    }
+    plant.sql(&format!("UPDATE cycle SET pv_um = {was} WHERE cycle = 1"));
+    // A copy without its end: the last records are covered by no signature.
+    plant.sql(
+        "CREATE TABLE kept AS SELECT * FROM record; CREATE TABLE kept_run AS SELECT * FROM run;
+        DELETE FROM record WHERE seq > (SELECT max(seq) - 3 FROM record);
+        UPDATE run SET (records, head) = (SELECT seq, hash FROM record ORDER BY seq DESC LIMIT 1)",
+    );
+    {
+        let html = until_proven(&ServedPage::serve(&plant), "/runs/1");
+        let said = words(&html);
+        assert!(said.contains("Unbroken, but not proven at") && said.contains("nothing proves the records"), "{said}");
+        assert!(!html.contains("class=\"proven\""), "{said}");
+    }
+    plant.sql(
+        "INSERT INTO record SELECT * FROM kept ON CONFLICT DO NOTHING;
+        UPDATE run r SET (records, head) = (SELECT k.records, k.head FROM kept_run k); DROP TABLE kept, kept_run",
+    );
     let shown = ServedPage::serve(&plant);
     let answer = shown.visitor.get(&format!("/run?cell=cell-1&name={name}"));
     assert_eq!((answer.status, answer.header("location")), (303, vec!["/runs/1"]));
     let said = words(&until_proven(&shown, "/runs/1"));
     let records = plant.sql("SELECT count(*) FROM record");
     assert!(said.contains("Proven at") && said.contains(&format!(" {records} records ")), "{said}");
-    assert!(said.contains("key that is enrolled") && said.contains("SIMULATION"), "{said}");
+    assert!(said.contains("signed to the end") && said.contains("SIMULATION"), "{said}");
 
     // The report from the copy equals the report at the cell.
     let report = shown.visitor.get("/runs/1/report");

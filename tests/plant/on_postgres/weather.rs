@@ -5,6 +5,7 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
@@ -139,9 +140,18 @@ impl Cell {
     }
 }
 
-/// Returns true if the end of a run is on record.
+/// Returns true if the end of a run is on record. A record that is closed stays so, and is verified only once: the cells
+/// ask again and again for all of their runs.
 fn is_over(run: &Path) -> bool {
-    run.join("journal.sqlite").is_file() && verify(run).is_ok_and(|verified| verified.closed)
+    static OVER: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+    if OVER.lock().unwrap().contains(run) {
+        return true;
+    }
+    let is_over = run.join("journal.sqlite").is_file() && verify(run).is_ok_and(|verified| verified.closed);
+    if is_over {
+        OVER.lock().unwrap().insert(run.to_owned());
+    }
+    is_over
 }
 
 /// Runs this number of cells and parts under faults that are drawn from a seed.

@@ -162,6 +162,14 @@ fn unsigned_recipe_refused_as_incident() {
     }
     plant.sql("UPDATE approval SET signature = repeat('ab', 64) WHERE person = 'Bob'");
     refused(&["version 1 of small", "is signed by Ada of", "two signatures"]);
+    let listed = plant.does(&["plant", "recipes", "--plant", "planner.toml"]);
+    assert!(listed.contains("signed by Ada; WRONG SIGNATURE of Bob"), "{listed}");
+    let json: Value =
+        serde_json::from_str(&plant.does(&["plant", "recipes", "--json", "--plant", "planner.toml"])).unwrap();
+    assert_eq!([&json[0]["signed_by"], &json[0]["wrong_signatures"]], [&json!(["Ada"]), &json!(["Bob"])]);
+    let queue = ["plant", "queue", "SN-2", "--recipe", "small", "--plant", "planner.toml"];
+    let (_, told) = plant.ends(&queue, 2);
+    assert!(told.contains("has 1 of the 2 required signatures, and 1 wrong"), "{told}");
     // A cell that knows only one of the two approvers.
     let one = approvers.split("\n[[approver]]").nth(1).unwrap();
     cell(&plant, "cell-2", &format!("\n[[approver]]{one}"));
