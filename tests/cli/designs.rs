@@ -51,6 +51,7 @@ fn write_inputs(folder: &Path) {
         let value = TERMS.iter().find(|term| (term.0, term.1) == (i, j)).map_or(0.0, |term| term.2);
         writeln!(lens, "  XDAT {k} {value:e}").unwrap();
     }
+    lens += "SURF 2\n  TYPE STANDARD\n  CURV 0\n";
     fs::write(folder.join("lens.zmx"), lens).unwrap();
     let mut measured = "x_mm,y_mm,z_mm\n".to_owned();
     let (sine, cosine) = 0.02f64.sin_cos();

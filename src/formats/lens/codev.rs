@@ -36,10 +36,17 @@ const OF_SURFACES: [&str; 27] = [
     "RDX", "CUX", "SLB", "CIR", "REX", "REY", "ADX", "ADY", "ARO", "ELX", "ELY",
 ];
 
+/// Statements that change surfaces that are there already: what they leave is not read.
+const CHANGES: [&str; 9] = ["SCA", "DEL", "INS", "FLY", "COP", "MOV", "INT", "IN", "RES"];
+
 /// Surface as the file has it.
 #[derive(Clone, Default)]
 struct Block {
     label: String,
+    /// Whether the number of its `S` statement is a radius. `None` if the file did not say so before it.
+    has_radii: Option<bool>,
+    /// True for the image surface, and for a surface behind which another one stands.
+    is_complete: bool,
     /// Word of the type: SPH, CON, ASP, YTO and so on; `XYP` and its like of a special surface.
     kind: String,
     /// Number of the `S` statement: a radius or a curvature.
@@ -74,11 +81,11 @@ pub(super) fn parse_codev(path: &Path, text: &str) -> Result<LensModel, FormatEr
         }
         reader.take_statement(line, &words)?;
     }
-    let Reader { blocks, unit_mm, has_radii, .. } = reader;
+    let Reader { blocks, unit_mm, .. } = reader;
     if blocks.is_empty() {
         return Err(FormatError::NoData { path: path.to_owned(), expected: "surface" });
     }
-    let surfaces = (0..).zip(&blocks).map(|(number, block)| block.surface(number, unit_mm, has_radii)).collect();
+    let surfaces = (0..).zip(&blocks).map(|(number, block)| block.surface(number, unit_mm)).collect();
     Ok(LensModel { surfaces })
 }
 
@@ -248,6 +255,19 @@ impl Reader<'_> {
         if let Some(number) = begun_surface(&keyword) {
             return self.begin_surface(number, &statement);
         }
+        let is_of_surface = |keyword: &str| {
+            OF_SURFACES.contains(&keyword) || LETTERS.contains(&keyword) || begun_surface(keyword).is_some()
+        };
+        // The zoom and the pickup of other values, such as of a field or a thickness, change no shape.
+        let changes_shape = matches!(&keyword[..], "ZOO" | "PIK") && is_of_surface(&statement.word(1));
+        if changes_shape || CHANGES.contains(&&keyword[..]) {
+            return Err(statement.wrong(
+                "no statement that changes surfaces afterwards; save the lens again as it is then, and read that file",
+            ));
+        }
+        if is_coefficient(&keyword) {
+            return Err(statement.wrong(&format!("SCO before the coefficient {keyword}")));
+        }
         if !OF_SURFACES.contains(&keyword.as_str()) && !LETTERS.contains(&keyword.as_str()) {
             return Ok(());
         }
@@ -269,12 +289,14 @@ impl Reader<'_> {
     /// Begins a surface, or gives a numbered one its radius or curvature.
     fn begin_surface(&mut self, number: Option<usize>, statement: &Statement<'_>) -> Result<(), FormatError> {
         let value = if statement.words.len() > 1 { statement.value(1)? } else { 0.0 };
-        let block = Block { value, ..Block::default() };
+        let is_complete = statement.word(0) == "SI";
+        let block = Block { value, has_radii: self.has_radii, is_complete, ..Block::default() };
         match number {
             // A numbered surface that is not there yet is the next one.
             Some(number) if number < self.blocks.len() => {
-                self.blocks[number].value = value;
-                self.blocks[number].curvature = None;
+                let known = &mut self.blocks[number];
+                (known.value, known.has_radii, known.curvature) = (value, self.has_radii, None);
+                return Ok(());
             }
             Some(1) if self.blocks.is_empty() => self.blocks.extend([Block::default(), block]),
             Some(number) if number > self.blocks.len() => {
@@ -285,8 +307,17 @@ impl Reader<'_> {
             }
             _ => self.blocks.push(block),
         }
+        if let Some((_, before)) = self.blocks.split_last_mut() {
+            before.iter_mut().rev().take(1).for_each(|block| block.is_complete = true);
+        }
         Ok(())
     }
+}
+
+/// Returns true for the name of a coefficient, such as C4 or QB6, which is a statement only behind SCO.
+fn is_coefficient(keyword: &str) -> bool {
+    let is_number = |digits: &str| !digits.is_empty() && digits.bytes().all(|b| b.is_ascii_digit());
+    ["C", "QB", "QC"].iter().any(|prefix| keyword.strip_prefix(prefix).is_some_and(is_number))
 }
 
 /// Returns the curvature of a radius, of which 0 is a plane.
@@ -309,6 +340,15 @@ fn begun_surface(keyword: &str) -> Option<Option<usize>> {
 impl Block {
     /// Takes a statement about this surface. Its values begin with the word `at`.
     fn take_statement(&mut self, keyword: &str, at: usize, statement: &Statement<'_>) -> Result<(), FormatError> {
+        // A statement has one value; what stands behind it would be lost.
+        let values = match keyword {
+            "SCO" | "SPS" => 2,
+            "SLB" | "CIR" | "REX" | "REY" | "ELX" | "ELY" | "ADX" | "ADY" | "ARO" | "DIF" | "GRX" | "UDS" => usize::MAX,
+            _ => 1,
+        };
+        if statement.words.len().saturating_sub(at) > values {
+            return Err(statement.wrong(&format!("nothing behind the value of {keyword}; begin another statement")));
+        }
         match keyword {
             "SPH" | "CON" | "ASP" | "YTO" | "XTO" | "CYL" | "AAS" | "DIF" | "GRX" | "UDS" => {
                 self.kind = keyword.to_owned();
@@ -345,11 +385,11 @@ impl Block {
         Ok(())
     }
 
-    fn surface(&self, number: usize, unit_mm: Option<f64>, has_radii: Option<bool>) -> LensSurface {
+    fn surface(&self, number: usize, unit_mm: Option<f64>) -> LensSurface {
         let unit = unit_mm.unwrap_or(1.0);
         let kind = if self.kind.is_empty() { "SPH" } else { &self.kind };
         let has_terms = self.letters.values().chain(self.special.values()).any(|value| *value != 0.0);
-        let curvature = self.curvature(has_radii);
+        let curvature = self.curvature(self.has_radii);
         LensSurface {
             number,
             name: self.label.clone(),
@@ -360,6 +400,11 @@ impl Block {
             surface: match (unit_mm, curvature) {
                 (None, _) => Err("the file has no unit; add a statement DIM".to_owned()),
                 (_, Err(reason)) => Err(reason),
+                _ if !self.is_complete => {
+                    Err("the file ends with it, and can be cut in it; a lens ends with its image \
+                    surface (SI): save it again"
+                        .to_owned())
+                }
                 (Some(unit), Ok(curvature)) => match &self.unknown_aperture {
                     Some(keyword) => Err(format!(
                         "its aperture ({keyword}) is an ellipse or turned; remove the statement and give --aperture"

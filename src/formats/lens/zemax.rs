@@ -6,7 +6,7 @@
 //! the parameters of each type mean is in the OpticStudio manual (types Standard, Even Asphere, Odd Asphere, Extended
 //! Asphere, Extended Odd Asphere, Toroidal, Biconic, Extended Polynomial, Zernike Standard Sag, Zernike Fringe Sag, Q-Type).
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::path::Path;
 
 use regrind_core::geometry::Aperture;
@@ -28,6 +28,10 @@ struct Block {
     extra: BTreeMap<u32, f64>,
     outline: Outline,
     centre: [f64; 2],
+    /// Keyword, and index of a parameter, of each line that was taken: a value is stated once.
+    taken: HashSet<(String, Option<u32>)>,
+    /// True if no surface follows: the file can be cut in it.
+    is_last: bool,
 }
 
 /// Aperture of a surface as the file has it.
@@ -53,18 +57,27 @@ const MAX_SURFACES: usize = 10_000;
 const OF_SURFACES: [&str; 12] =
     ["TYPE", "COMM", "CURV", "CONI", "DIAM", "PARM", "XDAT", "CLAP", "SQAP", "ELAP", "USAP", "OBDC"];
 
+/// Types of surfaces that are read.
+const KINDS: [&str; 12] = [
+    "STANDARD", "EVENASPH", "ODDASPHE", "XASPHERE", "XOSPHERE", "TOROIDAL", "BICONICX", "XPOLYNOM", "SZERNSAG",
+    "FZERNSAG", "QED_TYPE", "COORDBRK",
+];
+
+/// Index of the parameter from which on newer files have the extra data.
+const FIRST_OF_EXTRA: u32 = 13;
+
 /// Reads the surfaces of a lens.
 ///
 /// # Errors
 /// Text that is not a lens file; a unit that is not known; a value that is not a number.
 pub(super) fn parse_zemax(path: &Path, text: &str) -> Result<LensModel, FormatError> {
     let mut blocks: Vec<Block> = Vec::new();
-    let mut unit_mm = 1.0;
+    let mut unit_mm = None;
     let mut is_in_block = false;
     let is_set_in = has_lines_set_in(text);
     for (i, line) in text.split(['\n', '\r']).enumerate() {
         let mut words = line.split_whitespace();
-        let Some(keyword) = words.next() else { continue };
+        let Some(keyword) = words.next().filter(|keyword| !keyword.starts_with('!')) else { continue };
         let line = Line { path, number: i + 1, text: line, values: words.collect() };
         if keyword == "SURF" {
             let number = line.whole(0, "the number of a surface")? as usize;
@@ -79,10 +92,10 @@ pub(super) fn parse_zemax(path: &Path, text: &str) -> Result<LensModel, FormatEr
         is_in_block &= belongs;
         if keyword == "UNIT" && (blocks.is_empty() || !belongs) {
             unit_mm = match line.values.first().copied().unwrap_or_default() {
-                "MM" => 1.0,
-                "CM" => 10.0,
-                "IN" | "INCH" | "INCHES" => 25.4,
-                "M" | "METER" | "METERS" => 1e3,
+                "MM" => Some(1.0),
+                "CM" => Some(10.0),
+                "IN" | "INCH" | "INCHES" => Some(25.4),
+                "M" | "METER" | "METERS" => Some(1e3),
                 _ => return Err(line.wrong("the unit MM, CM, IN or METER")),
             };
         }
@@ -95,6 +108,9 @@ pub(super) fn parse_zemax(path: &Path, text: &str) -> Result<LensModel, FormatEr
     }
     if blocks.is_empty() {
         return Err(FormatError::NoData { path: path.to_owned(), expected: "surface" });
+    }
+    if let Some(last) = blocks.last_mut() {
+        last.is_last = true;
     }
     Ok(LensModel { surfaces: blocks.iter().map(|block| block.surface(unit_mm)).collect() })
 }
@@ -143,6 +159,12 @@ impl Block {
     /// Takes a line of this surface.
     fn take_line(&mut self, keyword: &str, line: &Line<'_>) -> Result<(), FormatError> {
         let pair = || -> Result<[f64; 2], FormatError> { Ok([line.number(0)?, line.number(1)?]) };
+        if OF_SURFACES.contains(&keyword) {
+            let index = if matches!(keyword, "PARM" | "XDAT") { Some(line.indexed()?.0) } else { None };
+            if !self.taken.insert((keyword.to_owned(), index)) {
+                return Err(line.wrong("each value of a surface once"));
+            }
+        }
         match keyword {
             "TYPE" => self.kind = line.values.first().copied().unwrap_or("STANDARD").to_owned(),
             "COMM" => self.comment = line.values.join(" "),
@@ -156,21 +178,85 @@ impl Block {
             "ELAP" => self.outline = Outline::Ellipse(pair()?),
             "USAP" => self.outline = Outline::Unknown,
             "OBDC" => self.centre = pair()?,
+            // OpticStudio does not write it, but who edits a file by hand does.
+            "RADI" | "RADIUS" => return Err(line.wrong("CURV, the curvature")),
             _ => {}
         }
         Ok(())
     }
 
-    fn surface(&self, unit_mm: f64) -> LensSurface {
+    fn surface(&self, unit_mm: Option<f64>) -> LensSurface {
         let has_terms = self.parameters.values().chain(self.extra.values()).any(|value| *value != 0.0);
+        let is_known = KINDS.contains(&&self.kind[..]);
+        let is_curved =
+            self.kind != "COORDBRK" && (self.curvature != 0.0 || !is_known || (self.kind != "STANDARD" && has_terms));
+        let surface = match unit_mm {
+            None => Err("the file has no unit; add a line UNIT MM, or the unit that it has".to_owned()),
+            Some(_) if self.is_last && is_curved => {
+                Err("the file ends with it, and can be cut in it: a lens ends with \
+                its image surface; export the file again, or add the line SURF of a plane behind it"
+                    .to_owned())
+            }
+            Some(unit_mm) => self.check_parameters().and_then(|()| self.built(unit_mm)),
+        };
+        let unit_mm = unit_mm.unwrap_or(1.0);
         LensSurface {
             number: self.number,
             name: self.comment.clone(),
             kind: self.kind.clone(),
-            is_curved: self.kind != "COORDBRK" && (self.curvature != 0.0 || (self.kind != "STANDARD" && has_terms)),
+            is_curved,
             aperture: self.aperture(unit_mm),
             disc: self.terms_disc(unit_mm),
-            surface: self.built(unit_mm),
+            surface,
+        }
+    }
+
+    /// Checks that the surface has no parameter, and no extra data, that its type does not use, and that the last of its
+    /// extra data is there. Where values stand of which the meaning is not known, the surface is not known.
+    fn check_parameters(&self) -> Result<(), String> {
+        let kind = &self.kind[..];
+        let is_used = |index: u32| match kind {
+            "EVENASPH" | "ODDASPHE" => (1..=8).contains(&index),
+            "TOROIDAL" => index <= 8,
+            "BICONICX" => (1..=2).contains(&index),
+            "SZERNSAG" | "FZERNSAG" => index <= 10,
+            "COORDBRK" => true,
+            _ => false,
+        };
+        let count = |index: u32, first: u32| (self.extra(index) != 0.0).then(|| first + self.extra(index) as u32);
+        let end = match kind {
+            "XASPHERE" | "XOSPHERE" | "XPOLYNOM" | "TOROIDAL" | "SZERNSAG" | "FZERNSAG" => count(1, 3).or(Some(3)),
+            "QED_TYPE" => count(2, 4).or(Some(4)),
+            _ => None,
+        };
+        let is_zero = |value: &f64| *value == 0.0;
+        let surplus = |(index, value): &(&u32, &f64)| {
+            !(is_zero(value) || is_used(**index) || (end.is_some() && **index >= FIRST_OF_EXTRA))
+        };
+        if let Some((index, value)) = self.parameters.iter().find(surplus) {
+            return Err(format!(
+                "its parameter {index} is {value}, but surfaces of the type {kind} have none; remove it"
+            ));
+        }
+        let extras = self.parameters.iter().filter_map(|(index, value)| {
+            Some((index.checked_sub(FIRST_OF_EXTRA - 1).filter(|index| *index > 0)?, value))
+        });
+        let extras = self.extra.iter().map(|(index, value)| (*index, value)).chain(extras);
+        // OpticStudio uses no terms beyond their number, whatever the file has.
+        if end.is_none()
+            && kind != "COORDBRK"
+            && let Some((index, value)) = extras.clone().find(|(_, value)| !is_zero(value))
+        {
+            return Err(format!(
+                "its extra data {index} is {value}, but surfaces of the type {kind} have none; remove it"
+            ));
+        }
+        match end {
+            Some(end) if end > 4 && !extras.map(|(index, _)| index).any(|index| index + 1 == end) => Err(format!(
+                "its number of terms asks for the extra data {}, which are missing; export the file again",
+                end - 1
+            )),
+            _ => Ok(()),
         }
     }
 

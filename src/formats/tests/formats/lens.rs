@@ -11,8 +11,8 @@ fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/lens")
 }
 
-/// Types that are refused by their names, and surfaces with a peak.
-const REFUSED: [&str; 4] = ["CV-XTO", "CV-AAS", "ODDASPHE", "XOSPHERE"];
+/// Types that are refused by their names, surfaces with a peak, and a file without a unit.
+const REFUSED: [&str; 5] = ["CV-XTO", "CV-AAS", "ODDASPHE", "XOSPHERE", "unit-missing-is-mm"];
 
 #[test]
 fn sags_match_formulas() {
@@ -41,6 +41,92 @@ fn sags_match_formulas() {
     wrong.dedup_by_key(|line| line.split(' ').next().map(ToOwned::to_owned));
     assert!(wrong.is_empty(), "{wrong:#?}");
     assert!(count > 400, "{count}");
+}
+
+/// Returns the only curved surface of the text of a lens, or why there is none.
+fn only_surface(name: &str, text: &str) -> Result<f64, String> {
+    let lens = parse_lens(Path::new(name), text.as_bytes()).map_err(|error| error.to_string())?;
+    let surface = lens.choose(None).map_err(|error| error.to_string())?;
+    Ok(surface.surface.as_ref().unwrap().sag(3.0, 4.0).unwrap())
+}
+
+/// Each of these would be read with a term, a unit or a change of the lens lost.
+#[test]
+fn statements_of_codev_that_would_be_lost_are_refused() {
+    let lens = |statements: &str| format!("RDM;LEN\nDIM M\nSO 0 1e13\nS 85 5 BK7\n{statements}\nSI 0 0\nGO\n");
+    let good = only_surface("a.seq", &lens("ASP; K -0.7; A 2e-6; B -1e-9")).unwrap();
+    assert!(
+        (good - (25.0 / 85.0 / (1.0 + (1.0 - 0.3 * 25.0 / 7225.0f64).sqrt()) + 2e-6 * 625.0 - 1e-9 * 15625.0)).abs()
+            < 1e-12
+    );
+    for (statements, found) in [
+        ("ASP; A 2e-6 B -1e-9", "line 5"),
+        ("ASP; A 2e-6 &\n B -1e-9", "line 5"),
+        ("SPS XYP; SCO C4 1e-4 C5 2e-4", "line 5"),
+        ("SPS XYP; SCO C4 1e-4; C9 1e-5", "SCO before"),
+        ("K -0.7 0", "line 5"),
+        ("CON; RDY 85 100", "line 5"),
+    ] {
+        let refused = only_surface("a.seq", &lens(statements)).unwrap_err();
+        assert!(refused.contains(found), "{statements}: {refused}");
+    }
+    for change in [
+        "SCA 2",
+        "DEL S1",
+        "INS S1",
+        "FLY S1..2",
+        "INT S1 def.int",
+        "ZOO RDY S1 85 90",
+        "PIK RDY S1 S2 -1",
+        "IN more.seq",
+    ] {
+        let text = lens("ASP; K -0.7").replace("GO\n", &format!("{change}\nGO\n"));
+        let refused = only_surface("a.seq", &text).unwrap_err();
+        assert!(refused.contains("changes surfaces afterwards"), "{change}: {refused}");
+    }
+    // A zoom of a field, and a pickup of a thickness, change no shape.
+    for other in ["ZOO 2; ZOO YAN F1 0 1", "PIK THI S1 S2"] {
+        let text = lens("ASP; K -0.7; A 2e-6; B -1e-9").replace("GO\n", &format!("{other}\nGO\n"));
+        assert_eq!(only_surface("a.seq", &text), Ok(good), "{other}");
+    }
+    // RDM holds from where it stands, and a lens ends with its image surface.
+    let late = lens("ASP; K -0.7; A 2e-6; B -1e-9").replace("GO\n", "RDM N\nGO\n");
+    assert_eq!(only_surface("a.seq", &late), Ok(good));
+    let cut = lens("ASP; K -0.7; A 2e-6").replace("SI 0 0\nGO\n", "");
+    assert!(only_surface("a.seq", &(cut + &"! a remark\n".repeat(6000))).is_err());
+}
+
+#[test]
+fn lines_of_zemax_that_would_be_lost_are_refused() {
+    let lens = |lines: &str| {
+        format!(
+            "UNIT MM\nSURF 0\n  TYPE STANDARD\n  CURV 0\nSURF 1\n{lines}\n  DIAM 5\nSURF 2\n  TYPE STANDARD\n  CURV 0\n"
+        )
+    };
+    let asphere = "  TYPE EVENASPH\n  CURV 0.01\n  PARM 2 1e-6";
+    let good = only_surface("a.zmx", &lens(asphere)).unwrap();
+    let commented = asphere.replace("  PARM", "! a remark\n  PARM");
+    assert_eq!(only_surface("a.zmx", &lens(&commented)), Ok(good), "a remark belongs to no surface");
+    let polynomial = "  TYPE XPOLYNOM\n  CURV 0\n  XDAT 1 3\n  XDAT 2 1\n  XDAT 3 1e-3\n  XDAT 4 0\n  XDAT 5 1e-4";
+    assert!(only_surface("a.zmx", &lens(polynomial)).is_ok());
+    for (lines, found) in [
+        (asphere.replace("  PARM", "  CURV 0.02\n  PARM"), "once"),
+        (format!("{asphere}\n  PARM 2 0"), "once"),
+        (format!("{asphere}\n  PARM 9 1e-9"), "parameter 9"),
+        (format!("{asphere}\n  XDAT 1 1"), "extra data 1"),
+        ("  TYPE BICONICX\n  CURV 0.01\n  PARM 3 1e-5".to_owned(), "parameter 3"),
+        ("  TYPE STANDARD\n  RADI 100".to_owned(), "CURV"),
+        (polynomial.replace("\n  XDAT 5 1e-4", ""), "extra data 5"),
+        (asphere.replace("EVENASPH", "XYPOLY"), "XYPOLY"),
+    ] {
+        let refused = only_surface("a.zmx", &lens(&lines)).unwrap_err();
+        assert!(refused.contains(found), "{lines}: {refused}");
+    }
+    let no_unit = only_surface("a.zmx", &lens(asphere).replace("UNIT MM\n", "VERS 1\n")).unwrap_err();
+    assert!(no_unit.contains("no unit"), "{no_unit}");
+    let cut = lens(asphere);
+    let cut = cut.split("SURF 2").next().unwrap();
+    assert!(only_surface("a.zmx", cut).unwrap_err().contains("ends with it"));
 }
 
 /// The term of the first power has a peak on the axis. Without it, odd aspheres are read.
