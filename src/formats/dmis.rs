@@ -60,6 +60,8 @@ struct Reading {
     has_nominal: bool,
     statements: Statements,
     is_ended: bool,
+    /// True if another coordinate system was defined or recalled behind a point.
+    is_frame_changed: bool,
 }
 
 /// Reads the general statements of a DMIS file about its measurement, such as the plan, the cycle and the kind of
@@ -157,6 +159,12 @@ impl Reading {
         let text = statement.text.as_str();
         let (before, after) = text.split_once('/').unwrap_or((text, ""));
         let keyword = before.trim().to_ascii_uppercase();
+        if self.is_ended {
+            return Err(unexpected(path, statement, "nothing behind ENDFIL: one measurement in a file", text));
+        }
+        if changes_frame(&keyword, after) {
+            self.is_frame_changed = !self.points.is_empty();
+        }
         match keyword.as_str() {
             "UNITS" => self.unit(path, statement, after),
             "PRCOMP" => {
@@ -250,11 +258,28 @@ impl Reading {
             let (found, limit) = (MAX_POINTS as u64 + 1, MAX_POINTS as u64);
             return Err(FormatError::TooLarge { path: path.to_owned(), found, limit, unit: "points" });
         }
+        if self.is_frame_changed {
+            let expected =
+                "all points in one coordinate system; export the points of each system in a file of their own";
+            return Err(unexpected(
+                path,
+                statement,
+                expected,
+                "points behind a change of the system (D, DA or RECALL)",
+            ));
+        }
         let name = before.split_once('(').and_then(|(_, rest)| rest.split_once(')')).map_or("", |(name, _)| name);
         self.points.push(Point::from(at_mm));
         self.names.push(name.trim().to_owned());
         Ok(())
     }
+}
+
+/// Returns true for a statement that defines or recalls a coordinate system, which the points behind it are in.
+fn changes_frame(keyword: &str, after: &str) -> bool {
+    let is_system = |label: &str| label.starts_with("D(") || label.starts_with("DA(");
+    (is_system(keyword) && keyword.contains('='))
+        || (keyword == "RECALL" && is_system(&after.trim().to_ascii_uppercase()))
 }
 
 fn unexpected(path: &Path, statement: &Statement, expected: &str, found: &str) -> FormatError {
@@ -310,6 +335,23 @@ mod tests {
         let alone = "UNITS/MM\nF(P7)=FEAT/POINT,CART,91,92,93,0,0,1\nOUTPUT/FA(P7)\nENDFIL\n";
         assert!(matches!(parsed(alone), Err(FormatError::WrongKind { .. })));
         assert!(matches!(parsed("UNITS/MM\nENDFIL\n"), Err(FormatError::NoData { .. })));
+    }
+
+    #[test]
+    fn points_of_another_frame_are_refused() {
+        let point = "FA(P8)=FEAT/POINT,CART,1,2,3\n";
+        let with = |between: &str| parsed(&file().replace("ENDFIL", &format!("{between}\n{point}ENDFIL")));
+        let points = with("$$ nothing").unwrap().points.len();
+        for change in ["D(2)=TRANS/XORIG,100", "DA(2)=ROTATE/ZAXIS,90", "RECALL/DA(2)", "recall/ d(2)"] {
+            assert!(matches!(with(change), Err(FormatError::Unexpected { .. })), "{change}");
+            // Ahead of all points, and behind them, it changes none.
+            let ahead = file().replace("UNITS/", &format!("{change}\nUNITS/"));
+            assert_eq!(parsed(&ahead).unwrap().points.len() + 1, points, "{change}");
+            let behind = file().replace("ENDFIL", &format!("{change}\nENDFIL"));
+            assert_eq!(parsed(&behind).unwrap().points.len() + 1, points, "{change}");
+        }
+        let joined = file() + &file();
+        assert!(matches!(parsed(&joined), Err(FormatError::Unexpected { .. })));
     }
 
     #[test]

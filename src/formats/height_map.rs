@@ -174,11 +174,17 @@ pub(super) fn sample_spacing_mm(
     given_mm: Option<f64>,
 ) -> Result<[f64; 2], FormatError> {
     let unstated = stated_mm.into_iter().find(|stated| !(*stated > 0.0 && stated.is_finite()));
+    let is_any_stated = stated_mm.into_iter().any(|stated| stated > 0.0 && stated.is_finite());
     match (unstated, given_mm) {
         (None, None) => Ok(stated_mm),
-        (Some(_), Some(given)) if given > 0.0 && given.is_finite() => Ok([given; 2]),
-        (Some(found), _) => Err(FormatError::NoLateralScale { path: path.to_owned(), found: 1e-3 * found }),
-        (None, Some(given)) => Err(FormatError::LateralScaleStated { path: path.to_owned(), stated_mm, given }),
+        (_, Some(given)) if is_any_stated => {
+            Err(FormatError::LateralScaleStated { path: path.to_owned(), stated_mm, given })
+        }
+        (_, Some(given)) if given > 0.0 && given.is_finite() => Ok([given; 2]),
+        (found, _) => {
+            let found = 1e-3 * found.unwrap_or(0.0);
+            Err(FormatError::NoLateralScale { path: path.to_owned(), found })
+        }
     }
 }
 
@@ -234,7 +240,11 @@ mod tests {
     fn sample_spacing_is_stated_or_given() {
         let of = |stated_mm, given_mm| sample_spacing_mm(Path::new("m"), stated_mm, given_mm);
         assert_eq!(of([0.1, 0.2], None).unwrap(), [0.1, 0.2]);
-        for unstated in [[0.0; 2], [0.1, 0.0], [f64::NAN, 0.1], [f64::INFINITY; 2], [-1.0; 2]] {
+        for half in [[0.1, 0.0], [f64::NAN, 0.1]] {
+            assert!(matches!(of(half, None), Err(FormatError::NoLateralScale { .. })));
+            assert!(matches!(of(half, Some(0.3)), Err(FormatError::LateralScaleStated { .. })));
+        }
+        for unstated in [[0.0; 2], [f64::NAN; 2], [f64::INFINITY; 2], [-1.0; 2]] {
             assert!(matches!(of(unstated, None), Err(FormatError::NoLateralScale { .. })));
             assert_eq!(of(unstated, Some(0.3)).unwrap(), [0.3; 2]);
             for wrong in [0.0, -0.1, f64::NAN, f64::INFINITY] {

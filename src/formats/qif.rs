@@ -359,6 +359,7 @@ impl Qif<'_, '_, '_> {
 
     fn list(&self, node: Node<'_, '_>, unit_mm: f64, points: &mut Vec<Point>) -> Result<(), FormatError> {
         self.check_unit(node)?;
+        let there = points.len();
         let mut numbers = node.text().unwrap_or_default().split_ascii_whitespace();
         while let Some(first) = numbers.next() {
             let mut at_mm = [0.0; 3];
@@ -372,7 +373,7 @@ impl Qif<'_, '_, '_> {
             }
             points.push(Point::from(at_mm));
         }
-        Ok(())
+        self.check_count(node, "count", points.len() - there)
     }
 
     fn one_point(&self, node: Node<'_, '_>, unit_mm: f64, points: &mut Vec<Point>) -> Result<(), FormatError> {

@@ -270,6 +270,18 @@ fn parse_text(path: &Path, bytes: &[u8], version: Version) -> Result<HeightMap, 
 }
 
 fn read_field(path: &Path, line: &[u8], number: u64, fields: &mut [f64; 8]) -> Result<(), FormatError> {
+    let before = *fields;
+    read_value(path, line, number, fields)?;
+    // A field can be repeated, but not with another value.
+    match (0..fields.len()).find(|&k| !before[k].is_nan() && before[k] != fields[k]) {
+        Some(k) => {
+            Err(unexpected(path, &format!("line {number}"), &format!("{} {}", FIELDS[k], before[k]), excerpt(line)))
+        }
+        None => Ok(()),
+    }
+}
+
+fn read_value(path: &Path, line: &[u8], number: u64, fields: &mut [f64; 8]) -> Result<(), FormatError> {
     let line = without_comment(line);
     let at = line.iter().position(|&b| b == b'=').unwrap_or(line.len());
     let key = line[..at].trim_ascii();

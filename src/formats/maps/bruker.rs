@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{Bytes, checked_factor, length_mm, map_from_top};
+use super::{Bytes, MARK, checked_factor, length_mm, map_from_top};
 
 const MAGIC: &[u8] = b"VCA DATA\x01\x00\x00\x55";
 const MAX_DEPTH: usize = 32;
@@ -113,7 +113,7 @@ fn parse_bruker(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<Heig
     let scale_mm = quantity_mm("DataScale")?;
     map_from_top(path, [columns, rows], (spacing_mm, given_mm), |index| {
         let value = f64::from(file.f32(begin + 4 * index).ok()?);
-        (value.abs() < 1e38).then_some(value * scale_mm)
+        (value.abs() < MARK).then_some(value * scale_mm)
     })
 }
 

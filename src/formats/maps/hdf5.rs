@@ -10,7 +10,7 @@ use hdf5_reader::{Dataset, Hdf5File, OpenOptions};
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MAX_SAMPLES, MapFormat, check_size};
 use super::hdf5_value::{Value, attribute, numbers, table};
-use super::{checked_factor, length_mm, map_from_top, unexpected};
+use super::{MARK, checked_factor, checked_wavelength_nm, length_mm, map_from_top, unexpected};
 
 const MAGIC: &[u8] = b"\x89HDF\r\n\x1a\n";
 
@@ -19,9 +19,6 @@ const MAX_DECODED: usize = 8 * MAX_SAMPLES as usize;
 
 /// Largest ratio of the bytes of a dataset to those of its file. Deflate packs 1032 bytes into one at the most.
 const MAX_RATIO: usize = 1100;
-
-/// Heights of this magnitude and more are marks, whatever the file says.
-const MARK: f64 = 1e37;
 
 /// HDF5 format, detected by its first bytes.
 pub(in super::super) const FORMAT: MapFormat = MapFormat {
@@ -141,7 +138,7 @@ fn four_d(
         None => value.number(),
     });
     let wavelength_nm = wavelength_nm.ok_or_else(|| unexpected(path, group, "a wavelength in nm", "none"))?;
-    let wave_mm = 1e-6 * checked_factor(path, &format!("{group}, {key}"), "a number of nm", wavelength_nm)?;
+    let wave_mm = 1e-6 * checked_wavelength_nm(path, &format!("{group}, {key}"), wavelength_nm)?;
     let height = |waves: f64| (waves.is_finite() && waves.abs() < MARK).then_some(waves * wave_mm);
     let mut map = map_of(path, &place, &surface, ([0.0; 2], given_mm), height)?;
     map.notes.push("files of 4D do not say which row is the top one; the first row is taken as the top one".to_owned());
@@ -196,6 +193,12 @@ impl Attributes<'_> {
     /// Returns the distance of the samples that a converter states: its second parameter, in metres.
     fn pitch_mm(&self, name: &str) -> Result<f64, FormatError> {
         let converter = self.get(name)?;
+        let unit = converter.as_ref().and_then(|converter| converter.member("BaseUnit")).and_then(Value::text);
+        // The parameters are in metres for a pixel. Another unit would make them lengths of something else.
+        if let Some(other) = unit.filter(|unit| !matches!(unit.trim(), "Pixels" | "Meters")) {
+            let place = format!("{}, {name}", self.name);
+            return Err(unexpected(self.path, &place, "a converter of pixels to metres", other));
+        }
         let parameters = converter.as_ref().and_then(|converter| converter.member("Parameters"));
         match parameters {
             Some(Value::List(list)) => match list.get(1).and_then(Value::number) {

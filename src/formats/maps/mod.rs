@@ -70,6 +70,20 @@ impl<'a> Bytes<'a> {
     }
 }
 
+/// Magnitude from which on a height of 32 bits is a mark: programs write 1e38 in 32 bits, which is less than 1e38.
+const MARK: f64 = 9e37;
+
+/// Wavelengths of light, in nm, that a map can have been measured with.
+const WAVELENGTHS_NM: std::ops::RangeInclusive<f64> = 100.0..=20_000.0;
+
+/// Returns a wavelength in nm if it is one of light. `place` is for the message.
+fn checked_wavelength_nm(path: &Path, place: &str, wavelength_nm: f64) -> Result<f64, FormatError> {
+    if WAVELENGTHS_NM.contains(&wavelength_nm) {
+        return Ok(wavelength_nm);
+    }
+    Err(unexpected(path, place, "a wavelength of light, from 100 to 20,000 nm", format!("{wavelength_nm} nm")))
+}
+
 fn unexpected(path: &Path, place: &str, expected: &str, found: impl Into<String>) -> FormatError {
     FormatError::Unexpected {
         path: path.to_owned(),

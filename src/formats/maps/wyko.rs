@@ -7,7 +7,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{Bytes, checked_factor, map_from_top};
+use super::{Bytes, MARK, checked_factor, checked_wavelength_nm, map_from_top};
 
 const MAGIC: &[u8] = b"\x01\x00Directory";
 const ENTRY: usize = 24;
@@ -49,7 +49,7 @@ fn parse_wyko(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<Height
     let needed = |name: &str| number(name)?.ok_or_else(|| file.unexpected(name, "a block of this name", "none"));
     let checked = |name: &str, value: f64| checked_factor(path, name, "a number", value);
     let pitch_mm = checked("Pixel_size", needed("Pixel_size")?)?;
-    let wavelength_nm = checked("Wavelength", needed("Wavelength")?)?;
+    let wavelength_nm = checked_wavelength_nm(path, "Wavelength", needed("Wavelength")?)?;
     let aspect = checked("Aspect", number("Aspect")?.unwrap_or(1.0))?;
     let mult = checked("Mult", number("Mult")?.unwrap_or(1.0))?;
     let is_height = |block: &&Block| block.kind == 3 && HEIGHTS.contains(&block.name.as_str());
@@ -71,7 +71,7 @@ fn parse_wyko(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<Height
         let value = match size {
             1 => file.slice(at, 1).map(|b| f64::from(b[0])).ok()?,
             2 => file.i16(at).ok().filter(|raw| *raw < 32766).map(f64::from)?,
-            _ => file.f32(at).ok().map(f64::from).filter(|value| value.abs() < 1e38)?,
+            _ => file.f32(at).ok().map(f64::from).filter(|value| value.abs() < MARK)?,
         };
         value.is_finite().then_some(value * unit_mm)
     };

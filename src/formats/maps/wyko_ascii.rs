@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::super::error::FormatError;
 use super::super::height_map::{HeightMap, MapFormat, check_size};
-use super::{checked_factor, map_from_top, unexpected};
+use super::{checked_factor, checked_wavelength_nm, map_from_top, unexpected};
 
 /// Names of the arrays that have heights.
 const HEIGHTS: [&str; 5] = ["RAW_DATA", "RAW DATA", "OPD", "Raw", "SAMPLE_DATA"];
@@ -37,8 +37,8 @@ fn parse_wyko_ascii(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<
     let (_, first) = lines.next().unwrap_or((1, ""));
     let flags: Vec<&str> = first.trim_start_matches("Wyko ASCII Data File").split_whitespace().collect();
     let (is_matrix, is_nm) = match flags[..] {
-        ["Format", form, real, _] => (form == "0", real == "1"),
-        _ => return Err(wrong(1, "the word Format and three numbers", first)),
+        ["Format", form, real @ ("0" | "1"), _] => (form == "0", real == "1"),
+        _ => return Err(wrong(1, "the word Format and three numbers, the second of which is 0 or 1", first)),
     };
     if !is_matrix {
         return Err(wrong(1, "a matrix (format 0); export the map so", first));
@@ -90,7 +90,7 @@ impl Header {
             1e-6
         } else {
             let wavelength_nm = self.wavelength_nm.ok_or_else(|| missing("Wavelength"))?;
-            1e-6 * checked_factor(path, "Wavelength", "a number of nm", wavelength_nm)?
+            1e-6 * checked_wavelength_nm(path, "Wavelength", wavelength_nm)?
         };
         let mut values: Vec<Option<f64>> = Vec::new();
         for (number, line) in lines.take(columns) {

@@ -54,7 +54,7 @@ fn parse_zygo_xyz(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Result<He
         let words: Vec<&str> = line.split_whitespace().collect();
         let (x, y, height) = match words[..] {
             [] => continue,
-            [x, y, "No", "Data"] => (x, y, None),
+            [x, y, no, data] if no.eq_ignore_ascii_case("no") && data.eq_ignore_ascii_case("data") => (x, y, None),
             [x, y, z] => (x, y, Some(z)),
             _ => return Err(wrong(i + 1, "a column, a row and a height, or the words No Data")),
         };

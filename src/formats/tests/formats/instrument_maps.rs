@@ -153,6 +153,25 @@ fn replaced(bytes: &[u8], from: &[u8], to: &[u8]) -> Vec<u8> {
     bytes
 }
 
+#[test]
+fn units_and_wavelengths_of_maps_are_checked() {
+    let parse = |name: &str, bytes: &[u8]| parse_map(Path::new(name), bytes, None);
+    let name = "datx-latest-contiguous-nm.datx";
+    let plain = std::fs::read(folder().join(name)).unwrap();
+    assert!(parse(name, &plain).is_ok());
+    let inches = replaced(&plain, b"Pixels", b"Inches");
+    assert!(inches != plain && matches!(parse(name, &inches), Err(FormatError::Unexpected { .. })));
+    let table = Table { sample_spacing_mm: Some(0.5), ..Table::default() };
+    let scratch = tempfile::tempdir().unwrap();
+    for (name, wavelength) in [("4d-4sight.h5", b"632.8"), ("4d-4sight.h5", b"6.328")] {
+        let bytes = std::fs::read(folder().join(name)).unwrap();
+        let changed = replaced(&bytes, b"632.8", wavelength);
+        let path = scratch.path().join(name);
+        std::fs::write(&path, &changed).unwrap();
+        assert_eq!(read_measured_with_notes(&path, &table).is_ok(), changed == bytes);
+    }
+}
+
 /// Returns the place in the file that the error names.
 #[track_caller]
 fn refused_place(name: &str, bytes: &[u8]) -> String {
