@@ -61,7 +61,7 @@ pub(super) fn dialect_path(dialect: &str, cell: &Path) -> Option<PathBuf> {
 /// # Errors
 /// Returns an error if the file cannot be read. Otherwise returns all errors found in its text.
 pub fn read_named_dialect(dialect: &str, cell: &Path) -> Result<DialectFile, Problems> {
-    match BUILT_IN_DIALECTS.iter().find(|(name, _)| *name == dialect) {
+    match BUILT_IN_DIALECTS.iter().find(|(name, _)| name.eq_ignore_ascii_case(dialect)) {
         Some((name, text)) => parse_dialect(Path::new(name), text),
         None => read_dialect(&dialect_path(dialect, cell).unwrap_or_default()),
     }

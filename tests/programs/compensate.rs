@@ -570,6 +570,41 @@ fn planned_programs_come_back_in_their_dialect() {
     }
 }
 
+/// A dialect of the shop's own has other words for axes, feed and arcs.
+#[test]
+fn own_words_of_a_dialect_are_read_and_written() {
+    let bench = Shop::new(|_, _| 0.004, "M2\n");
+    let shipped = fs::read_to_string(regrind_testutils::root().join("config/dialects/fanuc.toml")).unwrap();
+    let own = |name: &str, changes: &[(&str, &str)]| {
+        let mut text = shipped.replace("#:schema", "# schema");
+        for (from, to) in changes {
+            assert!(text.contains(from), "{from}");
+            text = text.replace(from, to);
+        }
+        fs::write(bench.path(name), text).unwrap();
+        bench.path(name).display().to_string()
+    };
+    let words = "[words]\naxes = [\"U\", \"V\", \"W\"]\nfeed = \"E\"\n";
+    let turned = own("turned.toml", &[("[words]\n", words)]);
+    let swapped = own("swapped.toml", &[("\"G02 \"", "\"G99 \""), ("\"G03 \"", "\"G02 \""), ("\"G99 \"", "\"G03 \"")]);
+    let correct = |dialect: &str, program: &str| {
+        fs::write(bench.path("own"), program).unwrap();
+        bench.save_error(|_, _| 0.004, None);
+        bench.correct("own", "out", &["--dialect", dialect])
+    };
+    let program = "%\nO1\nG21 G90 G54\nG00 U0. V0. W5.\nG01 W1. E500.\nU8. V2.\nM30\n%\n";
+    let text = correct(&turned, program).unwrap();
+    for line in ["G00 U0.0000 V0.0000 W5.0000", "E500.", "G01 U8.0000 V2.0000 W0.9960"] {
+        assert!(text.lines().any(|found| found == line), "{line}: {text}");
+    }
+    let refused = correct(&turned, &program.replace("U8. V2.", "X8. V2.")).unwrap_err();
+    assert!(refused.contains("X is no word"), "{refused}");
+    // With the words of the two senses exchanged, an arc keeps the sense that the dialect gives its word.
+    let arc = "%\nO1\nG21 G90 G54 G17\nG00 X0. Y0. Z5.\nG01 Z1. F500.\nG03 X5. Y5. I5. J0.\nM30\n%\n";
+    let text = correct(&swapped, arc).unwrap();
+    assert!(text.lines().any(|found| found == "G03 X5.0000 Y5.0000 Z0.9960 I5.0000 J0.0000"), "{text}");
+}
+
 /// Arcs of a program stay arcs in each dialect while the map is constant.
 #[test]
 fn arcs_stay_arcs_in_their_dialect() {
@@ -658,6 +693,19 @@ fn programs_of_shops_are_corrected_in_their_dialect() {
     for line in ["G1 X0.000000 Y0.000000 Z0.996000", "G2 X10.000000 Y0.000000 Z0.996000 I5.000000 J0.000000", "M30"] {
         assert!(told.iter().any(|found| found.split_once(' ').is_some_and(|(_, rest)| rest == line)), "{told:#?}");
     }
+    // Without a word for the unit, that of the dialect is added, and the header of an archive stays the first lines.
+    let silent = constant("sinumerik", &sinumerik.replace("G710 ", "")).unwrap();
+    assert!(silent.contains("N10 G710 G90") && !silent.contains("G21"), "{silent}");
+    let archive = constant("sinumerik", &format!("%_N_MIRROR_MPF\n;$PATH=/_N_WKS_DIR\n{sinumerik}")).unwrap();
+    assert!(archive.starts_with("%_N_MIRROR_MPF\n;$PATH=/_N_WKS_DIR\n; Regrind"), "{archive}");
+    // G05.1 and G5.1 are one code, and a dwell has the letter of an axis.
+    let fast = fanuc.replace("G01 Z10000", "G5.1 Q1\r\nG04 X2.\r\nG01 Z10000");
+    let told = lines(&constant("fanuc", &fast).unwrap());
+    assert!(["G5.1 Q1", "G04 X2."].iter().all(|line| told.iter().any(|found| found == line)), "{told:#?}");
+    let twice = fanuc.replace("M30\r\n%", "M30\r\nO1235\r\nG01 X1.\r\nM30\r\n%");
+    assert!(constant("fanuc", &twice).unwrap_err().contains("another program"));
+    let unknown = constant("sinumerik", &sinumerik.replace("N30 ", "N30 TRANS X1\nN31 ")).unwrap_err();
+    assert!(unknown.contains("\"TRANS\" is not known"), "{unknown}");
     // An unknown line is refused with its number.
     for (name, program, line) in [
         ("fanuc", fanuc.replace("G02", "G65 P100"), 7),

@@ -160,10 +160,10 @@ impl<'a> ProgramCorrection<'a> {
     fn line(&mut self, line: &str) -> Result<Vec<u8>, Refusal> {
         if self.rewriter.control.ended {
             // No control reads beyond the end of the program.
-            return Ok(match &mut self.adapter {
-                None => format!("{line}\n").into_bytes(),
+            return match &mut self.adapter {
+                None => Ok(format!("{line}\n").into_bytes()),
                 Some(adapter) => adapter.after_end(line),
-            });
+            };
         }
         let neutral = match &mut self.adapter {
             None => NeutralLine::new(line),
@@ -218,9 +218,20 @@ impl DialectAdapter<'_> {
         Ok(text)
     }
 
-    fn after_end(&mut self, line: &str) -> Vec<u8> {
-        let line = self.base.without_number(line);
-        if line.is_empty() { Vec::new() } else { self.writer.copied(line, "") }
+    /// Copies a line behind the end of the program.
+    ///
+    /// # Errors
+    /// Another program begins: it would stay without the correction.
+    fn after_end(&mut self, line: &str) -> Result<Vec<u8>, Refusal> {
+        let text = self.base.without_number(line);
+        let moves =
+            |words: &str| block(words).is_ok_and(|block| block.words.iter().any(|word| b"XYZ".contains(&word.letter)));
+        let neutral = self.base.neutral(line).unwrap_or_default();
+        if self.base.is_name_line(line) || moves(&neutral.words) {
+            let found = "another program begins behind the end of the first one".to_owned();
+            return Err((found, "write each program into a file of its own, and correct each"));
+        }
+        Ok(if text.is_empty() { Vec::new() } else { self.writer.copied(text, "") })
     }
 }
 

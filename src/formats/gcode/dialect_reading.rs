@@ -74,10 +74,12 @@ impl<'a> DialectReader<'a> {
             return Ok(NeutralLine::copied(text, "%"));
         }
         let (code, comment) = self.divided(text)?;
-        if code.is_empty() {
-            return Ok(NeutralLine::copied(text, ""));
-        }
         let squeezed_text = squeezed(text);
+        if code.is_empty() {
+            // The folder of a Sinumerik archive stands directly behind its name.
+            let is_frame = has_g_words(self.dialect) && squeezed_text.starts_with(";$PATH=");
+            return Ok(NeutralLine { is_frame, ..NeutralLine::copied(text, "") });
+        }
         // The first block of Klartext also selects the unit.
         let selects_unit = !has_g_words(self.dialect) && squeezed_text.starts_with("BEGINPGM");
         let is_frame = !selects_unit
@@ -92,6 +94,11 @@ impl<'a> DialectReader<'a> {
         let words = if has_g_words(self.dialect) { self.g_words(code)? } else { self.klartext(text, code)? };
         let comment = comment.map_or(String::new(), |words| format!(" ;{words}"));
         Ok(NeutralLine { words: words.words + &comment, ..words })
+    }
+
+    /// Returns true for a line with the name or the number of a program.
+    pub(super) fn is_name_line(&self, line: &str) -> bool {
+        self.is_name(&squeezed(line.trim()))
     }
 
     /// Returns a line without the number of its block.
@@ -143,12 +150,16 @@ impl<'a> DialectReader<'a> {
             ));
         }
         let upper = code.to_ascii_uppercase();
-        // An assignment to an axis, and the radius of an arc.
-        let mut plain = upper.replace("CR=", "R");
-        for letter in ['X', 'Y', 'Z', 'I', 'J', 'K'] {
-            plain = plain.replace(&format!("{letter}="), &letter.to_string());
+        let plain = plain_words(&upper, self.dialect)?;
+        let block = block(&plain).map_err(|refusal| self.unknown_word(&upper).unwrap_or(refusal))?;
+        // A dwell in seconds, which Fanuc names by the letter of an axis.
+        let is_dwell = block.words.iter().any(|word| word.letter == b'G' && word.value == 4.0);
+        if is_dwell && block.words.iter().all(|word| matches!(word.letter, b'G' | b'X' | b'P' | b'F' | b'S')) {
+            return match block.words.iter().filter(|word| word.letter == b'G').count() {
+                1 => Ok(NeutralLine::copied(code, "")),
+                _ => Err(("a dwell stands with other G words".into(), "write G4 in a line of its own")),
+            };
         }
-        let block = block(&plain)?;
         let mut words = String::new();
         for word in &block.words {
             if !words.is_empty() {
@@ -157,11 +168,25 @@ impl<'a> DialectReader<'a> {
             match (word.letter, word.value) {
                 (b'G', 20.0) => self.inches = true,
                 (b'G', 21.0) => self.inches = false,
+                (b'G', code @ (0.0 | 1.0 | 2.0 | 3.0)) => {
+                    words += &format!("G{}", motion_of(self.dialect, code));
+                    continue;
+                }
                 _ => {}
             }
             words += &self.with_point(word.letter, word.value, word.text);
         }
         Ok(NeutralLine::new(words))
+    }
+
+    /// Returns the refusal of the first word of a line that is not a letter with a number.
+    fn unknown_word(&self, upper: &str) -> Option<Refusal> {
+        let is_unknown = |token: &&str| {
+            plain_words(token, self.dialect).is_ok_and(|plain| block(&plain).is_err()) && !token.starts_with(['/', '#'])
+        };
+        let token = upper.split_whitespace().find(is_unknown)?;
+        let remedy = "remove it if it does not move the tool, or write it into `setup` of a dialect of your own";
+        Some((format!("{token:?} is not known"), remedy))
     }
 
     /// Returns a word with its point: a coordinate without one counts increments on controls that say so.
@@ -222,6 +247,89 @@ impl<'a> DialectReader<'a> {
     }
 }
 
+/// Returns the letters of LinuxCNC for the words of a dialect of G words, the longest first.
+fn letters_of(dialect: &Dialect) -> Vec<(String, char)> {
+    let axes = dialect.words.axes.iter().zip(['X', 'Y', 'Z']);
+    let centres = dialect.arcs.iter().filter_map(|arcs| arcs.centre_words.as_ref());
+    let centres = centres.flat_map(|words| words.iter().zip(['I', 'J', 'K']));
+    let feed = [(&dialect.words.feed, 'F')];
+    let own = axes.chain(centres).chain(feed).map(|(word, letter)| (squeezed(word), letter));
+    let mut letters: Vec<(String, char)> = own.collect();
+    // An assignment to an axis and the radius of an arc of Sinumerik, and the plain letters for which it stands.
+    letters.push(("CR=".to_owned(), 'R'));
+    for letter in ['X', 'Y', 'Z', 'I', 'J', 'K', 'F'] {
+        let is_another =
+            |(word, of): &(String, char)| word.trim_end_matches('=') == letter.to_string() && *of != letter;
+        let is_own = letters.iter().any(|(word, of)| word.trim_end_matches('=') == letter.to_string() && *of == letter);
+        if !letters.iter().any(is_another) && is_own {
+            letters.extend([(letter.to_string(), letter), (format!("{letter}="), letter)]);
+        }
+    }
+    letters.sort_by_key(|(word, _)| std::cmp::Reverse(word.len()));
+    letters
+}
+
+/// Returns a line, in capital letters, with the letters of LinuxCNC in place of the words of a dialect.
+///
+/// # Errors
+/// The letter of an axis, of a centre or of the feed that is no word of the dialect.
+fn plain_words(upper: &str, dialect: &Dialect) -> Result<String, Refusal> {
+    let letters = letters_of(dialect);
+    let mut plain = String::with_capacity(upper.len());
+    let mut rest = upper;
+    while let Some(first) = rest.chars().next() {
+        let is_value =
+            |text: &str| text.trim_start().starts_with(|c: char| c.is_ascii_digit() || matches!(c, '.' | '+' | '-'));
+        let own = letters.iter().find_map(|(word, letter)| {
+            rest.strip_prefix(word.as_str()).filter(|behind| is_value(behind)).map(|behind| (*letter, behind))
+        });
+        match own {
+            Some((letter, behind)) => {
+                plain.push(letter);
+                rest = behind;
+            }
+            None if matches!(first, 'X' | 'Y' | 'Z' | 'F') && is_value(&rest[1..]) => {
+                let remedy = "write the words that the dialect's file has, or correct that file";
+                return Err((format!("{first} is no word of an axis or of the feed in this dialect"), remedy));
+            }
+            None => {
+                plain.push(first);
+                rest = &rest[first.len_utf8()..];
+            }
+        }
+    }
+    Ok(plain)
+}
+
+/// Returns the G code of LinuxCNC for the motion that a G code of the dialect means.
+fn motion_of(dialect: &Dialect, code: f64) -> u8 {
+    let number = |text: &str| -> Option<f64> {
+        let word = text.trim();
+        word.strip_prefix(['G', 'g']).and_then(|digits| digits.parse().ok())
+    };
+    let arcs = dialect.arcs.as_ref();
+    let own = [
+        number(&dialect.words.rapid),
+        number(&dialect.words.line),
+        arcs.and_then(|arcs| number(&arcs.clockwise)),
+        arcs.and_then(|arcs| number(&arcs.counter_clockwise)),
+    ];
+    own.iter().position(|own| *own == Some(code)).map_or(code as u8, |motion| motion as u8)
+}
+
+/// Returns the word by which a dialect selects the unit of a G word of LinuxCNC, if it has other words than G20 and G21.
+pub(super) fn own_unit(dialect: &Dialect, is_inches: bool) -> Option<&'static str> {
+    let mut words = dialect.program.setup.iter().flat_map(|line| line.split_whitespace());
+    let found = words.find(|word| unit_word(word).is_some())?.to_ascii_uppercase();
+    // With three digits, feeds have the unit too.
+    Some(match (found.len() == "G710".len(), is_inches) {
+        (true, false) => "G710",
+        (true, true) => "G700",
+        (false, false) => "G71",
+        (false, true) => "G70",
+    })
+}
+
 /// Returns the number of decimals of a coordinate: one more in inches.
 pub(super) fn decimals(dialect: &Dialect, inches: bool) -> u8 {
     dialect.numbers.decimals + u8::from(inches)
@@ -244,9 +352,18 @@ fn without_number<'l>(line: &'l str, dialect: &Dialect) -> &'l str {
     if digits > 0 { rest[digits..].trim_start() } else { line }
 }
 
-/// Returns a text in capital letters and without blanks.
+/// Returns a text in capital letters and without blanks. G05 and G5 are one code, so zeros ahead of it are left out.
 fn squeezed(text: &str) -> String {
-    text.chars().filter(|c| !c.is_whitespace()).map(|c| c.to_ascii_uppercase()).collect()
+    let plain: Vec<char> = text.chars().filter(|c| !c.is_whitespace()).map(|c| c.to_ascii_uppercase()).collect();
+    let mut squeezed = String::with_capacity(plain.len());
+    for (at, &c) in plain.iter().enumerate() {
+        let is_code = matches!(squeezed.chars().last(), Some('G' | 'M'));
+        let goes_on = plain.get(at + 1).is_some_and(char::is_ascii_digit);
+        if !(c == '0' && is_code && goes_on) {
+            squeezed.push(c);
+        }
+    }
+    squeezed
 }
 
 /// Tells whether a text fits a line of the dialect, in which placeholders stand for any text.

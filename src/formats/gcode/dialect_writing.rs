@@ -2,7 +2,7 @@
 
 use super::control::INCH_MM;
 use super::dialect::{ArcWords, CentreWords, Dialect};
-use super::dialect_reading::{decimals, has_g_words};
+use super::dialect_reading::{decimals, has_g_words, own_unit};
 use super::number::push_decimals;
 use super::read::{Block, GcodeWord, Refusal, block};
 use super::write::{comments, end_line, number};
@@ -75,7 +75,7 @@ impl<'a> DialectWriter<'a> {
             match motion {
                 Some(motion) if moves && !is_machine => self.motion(&mut out, motion.value as u8, &block)?,
                 _ if has_g_words(self.dialect) => {
-                    let words: Vec<&str> = block.words.iter().map(|word| word.text).collect();
+                    let words: Vec<String> = block.words.iter().map(|word| self.own_word(word)).collect();
                     if !words.is_empty() {
                         self.line(&mut out, &words.join(" "));
                     }
@@ -88,6 +88,21 @@ impl<'a> DialectWriter<'a> {
             self.line(&mut out, &line);
         }
         Ok(out)
+    }
+
+    /// Returns a word of LinuxCNC as a dialect of G words has it.
+    fn own_word(&self, word: &GcodeWord) -> String {
+        let words = &self.dialect.words;
+        let own = match word.letter {
+            b'X' | b'Y' | b'Z' => &words.axes[usize::from(word.letter - b'X')],
+            b'F' => &words.feed,
+            b'G' if word.value == 20.0 || word.value == 21.0 => {
+                let unit = own_unit(self.dialect, word.value == 20.0);
+                return unit.map_or_else(|| word.text.to_owned(), ToOwned::to_owned);
+            }
+            _ => return word.text.to_owned(),
+        };
+        format!("{own}{}", &word.text[1..])
     }
 
     /// Notes the unit and the plane that a line selects.
@@ -201,8 +216,8 @@ impl<'a> DialectWriter<'a> {
     }
 
     fn line(&mut self, out: &mut Vec<u8>, line: &str) {
-        // A percent sign is not a block and has no number.
-        if line != "%" {
+        // A percent sign, and the name behind it, is not a block and has no number.
+        if !line.starts_with('%') {
             number(out, self.dialect, self.numbered);
             self.numbered += 1;
         }
