@@ -49,12 +49,12 @@ const SAMPLE_BY_OTHER_WIRES: u64 = 10;
 const SAMPLE_OF_FORGETFUL: u64 = 10;
 const SAMPLE_OF_FULL_DISKS: u64 = 10;
 const KEPT_OF_FULL_DISKS: &[u64] = &[3_000_338];
-/// One seed for each third register of the two blocks; more draw each register.
+/// One seed for each fifth register of the two blocks; more draw each register.
 const SAMPLE_OF_LIARS: u64 = 104;
-const STRIDE_OF_LIARS: usize = 3;
+const STRIDE_OF_LIARS: usize = 5;
 
 /// Distance, in effects, between the points at which the program dies once.
-const STRIDE: usize = 331;
+const STRIDE: usize = 499;
 
 /// Runs schedules on all processors; reports which seed broke which promise.
 fn run_all(schedules: &[Schedule]) -> Tally {
