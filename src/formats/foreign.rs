@@ -131,8 +131,6 @@ fn by_lines(text: &[u8]) -> Option<Foreign> {
         ("an IGES file", SAMPLE)
     } else if words("VERS ") && has(b"SURF 0") {
         ("a lens file of Zemax (.zmx)", DEFINE)
-    } else if second.starts_with(b"GRD ") {
-        ("an interferogram file of Code V (.int)", "export points as text, or the map as X3P")
     } else if is_sag {
         ("a grid of sags of Zemax (.dat)", "write x, y and the height of each node as a table of three columns")
     } else if words("DIM ") && first.contains(&b'=') {

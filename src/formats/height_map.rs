@@ -101,13 +101,16 @@ impl HeightMap {
     }
 }
 
+/// Parser of the bytes of a map; see [`MapFormat::parse`].
+type MapParser = fn(&Path, &[u8], Option<f64>) -> Result<MapPoints, FormatError>;
+
 /// Format of maps.
 pub(super) struct MapFormat {
     /// Returns true if the first bytes of a file are those of this format.
     pub(super) begins: fn(&[u8]) -> bool,
     /// Parses the bytes of a file; the path names the file in messages. The number is the distance of the samples in mm
     /// that a person gives for a file that states none.
-    pub(super) parse: fn(&Path, &[u8], Option<f64>) -> Result<MapPoints, FormatError>,
+    pub(super) parse: MapParser,
 }
 
 impl MapFormat {

@@ -6,11 +6,11 @@ use regrind_core::geometry::Point;
 
 use super::error::FormatError;
 use super::height_map::MapFormat;
-use super::maps::{alicona, bruker, digital_surf, hdf5, wyko, wyko_ascii, zygo_xyz};
+use super::maps::{alicona, bruker, codev_interferogram, digital_surf, hdf5, wyko, wyko_ascii, zygo_xyz};
 use super::{metropro, sdf, whole, x3p};
 
 /// All formats of maps. A new format needs its own source file and an entry here.
-const FORMATS: [MapFormat; 10] = [
+const FORMATS: [MapFormat; 11] = [
     x3p::FORMAT,
     sdf::FORMAT,
     metropro::FORMAT,
@@ -21,6 +21,7 @@ const FORMATS: [MapFormat; 10] = [
     zygo_xyz::FORMAT,
     hdf5::FORMAT,
     alicona::FORMAT,
+    codev_interferogram::FORMAT,
 ];
 
 /// Detects the format of a measured map from `head`, the first bytes of a file. Returns `None`

@@ -39,6 +39,8 @@ pub enum PlantError {
     NoRun { cell: String, name: String },
     #[error("{0}")]
     Recipe(String),
+    #[error("{name}: {what}")]
+    Member { name: String, what: String },
     #[error("part {work} of the queue: {reason}; to take another part: regrind work")]
     Work { work: i64, reason: String },
     #[error("{}: the folder for large files cannot be used: {source}; check that it exists, and that you have the \

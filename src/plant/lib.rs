@@ -25,7 +25,7 @@ pub use page::PlantPage;
 pub use recipes::{Approval, PlantRecipe};
 pub use replication::{ReplicationResult, Replicator, run_overview};
 pub use reported::Reported;
-pub use schema::{PlantRole, check_layout, enrol, enrol_cell, migrate, retire_cell};
+pub use schema::{NewMember, PlantRole, add_cell_keys, check_layout, enrol, enrol_cell, migrate, retire_cell};
 pub use settings::{Approver, ArtefactSettings, DatabaseSettings};
 pub use studies::{LeasedRun, Study};
 pub use tokio_postgres::Row;

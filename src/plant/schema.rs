@@ -6,7 +6,7 @@ use super::error::{PlantError, refused};
 use super::link::DatabaseLink;
 
 /// All versions of the layout, each as a migration from the one before. A published migration never changes.
-const MIGRATIONS: [(i32, &str); 7] = [
+const MIGRATIONS: [(i32, &str); 8] = [
     (1, include_str!("migrations/0001_records.sql")),
     (2, include_str!("migrations/0002_work.sql")),
     (3, include_str!("migrations/0003_views.sql")),
@@ -14,6 +14,7 @@ const MIGRATIONS: [(i32, &str); 7] = [
     (5, include_str!("migrations/0005_page.sql")),
     (6, include_str!("migrations/0006_knowledge.sql")),
     (7, include_str!("migrations/0007_yield.sql")),
+    (8, include_str!("migrations/0008_queue.sql")),
 ];
 
 /// Groups of roles. Each role that signs in is a member of one group.
@@ -135,72 +136,126 @@ impl PlantRole {
     }
 }
 
-/// Registers the cell `name` in the plant. Creates the database role `role` with this `password`, and stores the public
-/// `keys` that may sign the records of the cell. If the cell is registered already, sets its role and password, adds
-/// the new keys, and ends its retirement.
+/// Member of a plant that is to be enrolled.
+#[derive(Clone, Copy, Debug)]
+pub struct NewMember<'a> {
+    /// Name in the plant.
+    pub name: &'a str,
+    /// Name of the database role.
+    pub role: &'a str,
+    /// Password of the role.
+    pub password: &'a str,
+    /// True if the member is enrolled already: it gets a new password, and its retirement ends. Otherwise a member that is
+    /// enrolled already is refused.
+    pub is_again: bool,
+}
+
+/// Registers a cell in the plant. Creates its database role, and stores the public `keys` that may sign the records of the
+/// cell, in addition to those that it has.
 ///
 /// # Errors
-/// Fails if the database role of the caller has no right to create roles, if another cell has the role `role`, or if
-/// the database cannot be reached.
-pub async fn enrol_cell(
-    link: &mut DatabaseLink,
-    name: &str,
-    role: &str,
-    password: &str,
-    keys: &[String],
-) -> Result<(), PlantError> {
+/// Fails as [`enrol`] does, or if another cell has the role.
+pub async fn enrol_cell(link: &mut DatabaseLink, cell: NewMember<'_>, keys: &[String]) -> Result<(), PlantError> {
     let failed = refused("to enrol the cell");
+    let NewMember { name, role, .. } = cell;
     let step = link.client_mut().transaction().await.map_err(&failed)?;
-    make_role(&step, role, password, "regrind_cell").await?;
+    let other = "SELECT name FROM regrind.cell WHERE role = $2::text::name AND name <> $1";
+    if let Some(row) = step.query_opt(other, &[&name, &role]).await.map_err(&failed)? {
+        let what =
+            format!("the cell {} has the role {role} already; give this cell another name", row.get::<_, &str>(0));
+        return Err(PlantError::Member { name: name.to_owned(), what });
+    }
+    make_role(&step, cell, "regrind_cell").await?;
     step.execute(
         "INSERT INTO regrind.cell (name, role) VALUES ($1, $2::text::name) ON CONFLICT (name) DO UPDATE SET role = excluded.role, retired_at = NULL",
         &[&name, &role],
     )
     .await
     .map_err(&failed)?;
-    for key in keys {
-        step.execute(
-            "INSERT INTO regrind.cell_key (cell, key) SELECT id, $2 FROM regrind.cell WHERE name = $1 ON CONFLICT DO NOTHING",
-            &[&name, key],
-        )
-        .await
-        .map_err(&failed)?;
-    }
+    store_keys(&step, name, keys).await?;
     step.commit().await.map_err(&failed)
 }
 
-/// Creates the database role `role` for a person or a program, with the password `password`. `of` is the purpose of the
-/// role; it determines the rights. If the role exists already, sets its password and adds the rights.
+/// Stores further public `keys` that may sign the records of the cell `name`. Its password stays. Returns false if there
+/// is no such cell.
 ///
 /// # Errors
+/// Fails if the database role of the caller has no right to do so, or if the database cannot be reached.
+pub async fn add_cell_keys(link: &mut DatabaseLink, name: &str, keys: &[String]) -> Result<bool, PlantError> {
+    let failed = refused("to store a key");
+    let step = link.client_mut().transaction().await.map_err(&failed)?;
+    let known = step.query_opt("SELECT 1 FROM regrind.cell WHERE name = $1", &[&name]).await.map_err(&failed)?;
+    if known.is_none() {
+        return Ok(false);
+    }
+    store_keys(&step, name, keys).await?;
+    step.commit().await.map_err(&failed)?;
+    Ok(true)
+}
+
+async fn store_keys(step: &tokio_postgres::Transaction<'_>, name: &str, keys: &[String]) -> Result<(), PlantError> {
+    let text = "INSERT INTO regrind.cell_key (cell, key) SELECT id, $2 FROM regrind.cell WHERE name = $1 ON CONFLICT DO NOTHING";
+    for key in keys {
+        step.execute(text, &[&name, key]).await.map_err(refused("to store a key"))?;
+    }
+    Ok(())
+}
+
+/// Creates the database role of a person or a program. `of` is the purpose of the role; it determines the rights.
+///
+/// # Errors
+/// Fails if the role exists and the member is not enrolled again, if it is of another kind, or if Regrind did not make it.
 /// Fails if the database role of the caller has no right to create roles, or if the database cannot be reached.
-pub async fn enrol(link: &mut DatabaseLink, role: &str, password: &str, of: PlantRole) -> Result<(), PlantError> {
+pub async fn enrol(link: &mut DatabaseLink, member: NewMember<'_>, of: PlantRole) -> Result<(), PlantError> {
     let failed = refused("to enrol the role");
     let step = link.client_mut().transaction().await.map_err(&failed)?;
-    make_role(&step, role, password, of.group()).await?;
+    make_role(&step, member, of.group()).await?;
     step.commit().await.map_err(&failed)
 }
 
-/// Creates the database role `role` as a member of `group`. If the role exists, sets its password and adds it to the
-/// group. `step` is the open transaction.
+/// Creates the database role of a member as a member of `group`, or gives a role that is one already a new password.
+/// `step` is the open transaction.
 ///
 /// SQL commands for roles accept no query parameters. Therefore the server first builds the commands with quoted names
 /// and password, and then executes them.
 async fn make_role(
     step: &tokio_postgres::Transaction<'_>,
-    role: &str,
-    password: &str,
+    member: NewMember<'_>,
     group: &str,
 ) -> Result<(), PlantError> {
+    let NewMember { name, role, password, is_again } = member;
     let failed = refused("to make the role");
-    let known =
-        step.query_opt("SELECT 1 FROM pg_roles WHERE rolname = $1::text::name", &[&role]).await.map_err(&failed)?;
-    let verb = if known.is_some() { "ALTER" } else { "CREATE" };
-    let text = "SELECT format('%s ROLE %I LOGIN NOSUPERUSER NOCREATEDB NOCREATEROLE NOREPLICATION NOBYPASSRLS PASSWORD %L', $1::text, $2::text, $3::text),
-        format('GRANT %I TO %I', $4::text, $2::text)";
-    let made = step.query_one(text, &[&verb, &role, &password, &group]).await.map_err(&failed)?;
-    for command in [made.get::<_, &str>(0), made.get::<_, &str>(1)] {
-        step.batch_execute(command).await.map_err(&failed)?;
+    let refused_member = |what: String| Err(PlantError::Member { name: name.to_owned(), what });
+    let known = "SELECT array(SELECT g.rolname::text FROM pg_auth_members m JOIN pg_roles g ON g.oid = m.roleid WHERE m.member = r.oid)
+        FROM pg_roles r WHERE rolname = $1::text::name";
+    let groups = step.query_opt(known, &[&role]).await.map_err(&failed)?.map(|row| row.get::<_, Vec<String>>(0));
+    let text = match groups.as_deref() {
+        // Its other rights were given when it was made. Only a superuser may state them again.
+        Some([only]) if only == group && is_again => {
+            "SELECT format('ALTER ROLE %I LOGIN PASSWORD %L', $1::text, $2::text)"
+        }
+        Some([only]) if only == group => {
+            return refused_member(
+                "it is enrolled already; --again gives it a new password, and ends a retirement".into(),
+            );
+        }
+        Some(groups) => {
+            let what = match groups.iter().find_map(|group| group.strip_prefix("regrind_")) {
+                Some(kind) => format!("the role {role} is that of a {kind}; choose another name"),
+                None => format!("the database has a role {role} that Regrind did not make; choose another name"),
+            };
+            return refused_member(what);
+        }
+        None if is_again => return refused_member("it is not enrolled; leave out --again".into()),
+        None => {
+            "SELECT format('CREATE ROLE %I LOGIN NOSUPERUSER NOCREATEDB NOCREATEROLE NOREPLICATION NOBYPASSRLS PASSWORD %L', $1::text, $2::text)"
+        }
+    };
+    let made = step.query_one(text, &[&role, &password]).await.map_err(&failed)?;
+    step.batch_execute(made.get(0)).await.map_err(&failed)?;
+    if groups.is_none() {
+        let grant = step.query_one("SELECT format('GRANT %I TO %I', $1::text, $2::text)", &[&group, &role]).await;
+        step.batch_execute(grant.map_err(&failed)?.get(0)).await.map_err(&failed)?;
     }
     Ok(())
 }

@@ -92,6 +92,15 @@ impl Lease {
         self.ask(link, "SELECT return_work($1, $2, $3)", &[&self.work, &self.number, &reason]).await
     }
 
+    /// Returns the leased part to the queue because this cell cannot prove its recipe. The plant offers this part to this
+    /// cell after all others. `reason` is the reason, which the plant stores.
+    ///
+    /// # Errors
+    /// The same as for [`Lease::hand_back`].
+    pub async fn refuse_recipe(&self, link: &DatabaseLink, reason: &str) -> Result<(), PlantError> {
+        self.ask(link, "SELECT refuse_recipe($1, $2, $3)", &[&self.work, &self.number, &reason]).await
+    }
+
     async fn ask(&self, link: &DatabaseLink, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<(), PlantError> {
         answered(link, self.work, text, values).await
     }

@@ -89,7 +89,7 @@ impl Plant {
         (out, errors)
     }
 
-    /// Returns the answer to a query of the owner.
+    /// Returns the answer to a query of the superuser of the server.
     fn sql(&self, text: &str) -> String {
         self.postgres.sql("regrind", &format!("SET search_path = regrind; {text}"))
     }

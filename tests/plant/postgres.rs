@@ -15,8 +15,10 @@ use tempfile::TempDir;
 
 use crate::program::PATIENCE;
 
-/// Owner of the cluster, who signs in with the password below.
+/// Owner of the database, who can make roles and is no superuser, as docs/plant.md makes it. Signs in with the password below.
 pub const OWNER: &str = "owner";
+/// Superuser of the server, who signs in with the same password. Only the tests act as this role.
+const SUPERUSER: &str = "postgres";
 const PASSWORD: &str = "of-the-owner";
 /// Port number in the name of the socket. Nothing listens on this port unless a test asks for TLS.
 const PORT: u16 = 5432;
@@ -52,7 +54,8 @@ impl Postgres {
         done(copy.args(["--recursive", "--preserve=mode"]).arg(made.path().join("data/.")).arg(postgres.data()));
         postgres.copied_from = Some(made);
         postgres.go_on();
-        postgres.sql("postgres", "CREATE DATABASE regrind");
+        postgres.sql("postgres", &format!("CREATE ROLE {OWNER} LOGIN CREATEROLE PASSWORD '{PASSWORD}'"));
+        postgres.sql("postgres", &format!("CREATE DATABASE regrind OWNER {OWNER}"));
         postgres
     }
 
@@ -69,7 +72,7 @@ impl Postgres {
         fs::create_dir(&data).unwrap();
         self.give(&data);
         let mut initdb = self.program("initdb");
-        initdb.args(["--no-sync", "--auth=scram-sha-256", "--encoding=UTF8", "--locale=C", "--username", OWNER]);
+        initdb.args(["--no-sync", "--auth=scram-sha-256", "--encoding=UTF8", "--locale=C", "--username", SUPERUSER]);
         done(initdb.arg("--pwfile").arg(password).arg("--pgdata").arg(&data));
         *kept = Arc::downgrade(&made);
         made
@@ -136,9 +139,9 @@ impl Postgres {
         server.wait().unwrap();
     }
 
-    /// Returns the answer to a query of the owner, one line per row.
+    /// Returns the answer to a query of the superuser, one line per row.
     pub fn sql(&self, database: &str, text: &str) -> String {
-        self.ask_as(OWNER, PASSWORD, database, text).unwrap_or_else(|error| panic!("{text}: {error}"))
+        self.ask_as(SUPERUSER, PASSWORD, database, text).unwrap_or_else(|error| panic!("{text}: {error}"))
     }
 
     /// Returns the answer to a query of a role, or the error.
@@ -164,10 +167,10 @@ impl Postgres {
         if asked.status.success() { Ok(text(asked.stdout)) } else { Err(text(asked.stderr)) }
     }
 
-    /// Returns a command of PostgreSQL, signed in as the owner.
+    /// Returns a command of PostgreSQL, signed in as the superuser.
     pub fn tool(&self, name: &str) -> Command {
         let mut tool = Command::new(self.bin.join(name));
-        tool.args(["-U", OWNER, "-p", &self.port.to_string()]).arg("-h").arg(self.socket());
+        tool.args(["-U", SUPERUSER, "-p", &self.port.to_string()]).arg("-h").arg(self.socket());
         tool.env("PGPASSWORD", PASSWORD).stdin(Stdio::null());
         tool
     }
@@ -198,7 +201,8 @@ impl Postgres {
 
     /// Returns true if the server accepts connections: its socket exists before it does.
     fn answers(&self) -> bool {
-        UnixStream::connect(self.socket_file()).is_ok() && self.ask_as(OWNER, PASSWORD, "postgres", "SELECT 1").is_ok()
+        UnixStream::connect(self.socket_file()).is_ok()
+            && self.ask_as(SUPERUSER, PASSWORD, "postgres", "SELECT 1").is_ok()
     }
 
     fn give(&self, path: &Path) {

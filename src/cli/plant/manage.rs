@@ -28,6 +28,7 @@ pub(in crate::cli) struct Arguments {
 enum PlantCommand {
     Init(members::ToInit),
     Enrol(members::ToEnrol),
+    AddKey(members::ToAddKey),
     Retire(members::ToRetire),
     Cells(members::ToList),
     Runs(runs::ToList),
@@ -47,6 +48,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     match &arguments.what {
         PlantCommand::Init(of) => members::init(of),
         PlantCommand::Enrol(of) => members::enrol(of),
+        PlantCommand::AddKey(of) => members::add_key(of),
         PlantCommand::Retire(of) => members::retire(of),
         PlantCommand::Cells(of) => members::list(of),
         PlantCommand::Runs(of) => runs::list(of),

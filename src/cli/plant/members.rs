@@ -3,12 +3,13 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use regrind::formats::write_private;
+use regrind::formats::{FormatError, write_private};
 use regrind::journal::PublicKey;
-use regrind_plant::{PlantRole, enrol_cell, migrate, retire_cell};
+use regrind_plant::{NewMember, PlantRole, add_cell_keys, enrol_cell, migrate, retire_cell};
 use serde_json::json;
 
 use super::super::failure::Failure;
+use super::super::words::counted;
 use super::super::{Outcome, key, name};
 use super::plant_file::{Where, open, open_any};
 
@@ -34,6 +35,9 @@ A cell reads its own data, replicates its records and takes parts from the queue
 proposes recipes and queues parts. A reader, such as Grafana, reads everything. A worker simulates the runs of studies.
 The password is in a file that only its owner can read: carry this file to the computer that signs in.
 
+A member that is enrolled already is refused: with --again it gets a new password, its retirement ends, and the old password
+file is replaced when the database has the new one. `regrind plant add-key` adds a key and keeps the password.
+
 Examples:
   regrind plant enrol cell-1 --plant owner.toml --password-file cell-1.password --key cell-1.key
   regrind plant enrol office --as reader --plant owner.toml --password-file office.password
@@ -46,9 +50,12 @@ pub(super) struct ToEnrol {
     /// Kind of the new member
     #[arg(long = "as", value_enum, default_value = "cell")]
     role: Kind,
-    /// File for the password; created or overwritten
+    /// File for the password; created or replaced
     #[arg(long, value_name = "FILE")]
     password_file: PathBuf,
+    /// Give a member that is enrolled already a new password, and end its retirement
+    #[arg(long)]
+    again: bool,
     /// Public key that may sign the records of the cell, or the file with the output of `regrind audit key --json`;
     /// repeat the option for another key
     #[arg(long, value_name = "PUBLIC|FILE", value_parser = key::public)]
@@ -67,6 +74,27 @@ enum Kind {
     Reader,
     /// Makes the simulated runs of studies
     Worker,
+}
+
+/// Add a key that may sign the records of a cell; its password stays
+#[derive(Args, Debug)]
+#[command(after_help = "\
+A cell whose key is replaced keeps the old one for its earlier records.
+
+Example:
+  regrind plant add-key cell-1 --key cell-1-new.public --plant owner.toml
+
+Exit codes: 0 added; 1 there is no such cell; 2 the database refuses the command; 3 the database
+cannot be reached.")]
+pub(super) struct ToAddKey {
+    /// Name of the cell in the plant
+    #[arg(value_name = "NAME")]
+    name: String,
+    /// Public key, or the file with the output of `regrind audit key --json`; repeat the option for another key
+    #[arg(long, value_name = "PUBLIC|FILE", value_parser = key::public, required = true)]
+    key: Vec<PublicKey>,
+    #[command(flatten)]
+    plant: Where,
 }
 
 /// Remove a cell from the plant: it can no longer sign in, and its records stay
@@ -120,17 +148,52 @@ pub(super) fn enrol(arguments: &ToEnrol) -> Result<Outcome, Failure> {
     super::super::runtime()?.block_on(async {
         let mut link = open(&config).await?;
         let keys: Vec<String> = arguments.key.iter().map(ToString::to_string).collect();
-        // The file is written first: a lost password is useless, and a new one can be generated.
-        write_private(&arguments.password_file, format!("{password}\n").as_bytes())?;
-        match arguments.role {
-            Kind::Cell => enrol_cell(&mut link, &arguments.name, &role, &password, &keys).await?,
-            Kind::Planner => regrind_plant::enrol(&mut link, &role, &password, PlantRole::Planner).await?,
-            Kind::Reader => regrind_plant::enrol(&mut link, &role, &password, PlantRole::Reader).await?,
-            Kind::Worker => regrind_plant::enrol(&mut link, &role, &password, PlantRole::Worker).await?,
+        // The password is on the disk before the database has it, and replaces the old one when the database has it.
+        let path = &arguments.password_file;
+        let draft = PathBuf::from(format!("{}.new", path.display()));
+        write_private(&draft, format!("{password}\n").as_bytes())?;
+        let member = NewMember { name: &arguments.name, role: &role, password: &password, is_again: arguments.again };
+        let enrolled = match arguments.role {
+            Kind::Cell => enrol_cell(&mut link, member, &keys).await,
+            Kind::Planner => regrind_plant::enrol(&mut link, member, PlantRole::Planner).await,
+            Kind::Reader => regrind_plant::enrol(&mut link, member, PlantRole::Reader).await,
+            Kind::Worker => regrind_plant::enrol(&mut link, member, PlantRole::Worker).await,
+        };
+        match &enrolled {
+            // Whether the database has the password is not known: both files stay.
+            Err(error) if error.may_pass() => {}
+            Err(_) => {
+                // Nobody has the password.
+                let _ = std::fs::remove_file(&draft);
+            }
+            Ok(()) => {
+                let unwritable =
+                    |source| FormatError::Unwritable { path: path.clone(), action: "replacing it", source };
+                std::fs::rename(&draft, path).map_err(unwritable)?;
+            }
         }
-        let path = arguments.password_file.display();
+        enrolled?;
+        let path = path.display();
         super::super::print(&format!("{} signs in as {role}, with the password in {path}\n", arguments.name))?;
         Ok(Outcome::Accepted)
+    })
+}
+
+pub(super) fn add_key(arguments: &ToAddKey) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let mut link = open(&config).await?;
+        let keys: Vec<String> = arguments.key.iter().map(ToString::to_string).collect();
+        let name = &arguments.name;
+        if add_cell_keys(&mut link, name, &keys).await? {
+            super::super::print(&format!(
+                "the records of {name} may be signed by {} more\n",
+                counted(keys.len(), "key")
+            ))?;
+            return Ok(Outcome::Accepted);
+        }
+        super::super::print(&format!("there is no cell {name}; to see all cells: `regrind plant cells`\n"))?;
+        Ok(Outcome::NotInTolerance)
     })
 }
 

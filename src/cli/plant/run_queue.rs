@@ -100,6 +100,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             }
             Next::GivenBack => return Ok(Outcome::NotInTolerance),
         };
+        let lease = taken.lease.clone();
         let outcome = making::run(&making::Arguments {
             rehearsal: false,
             recipe,
@@ -112,7 +113,14 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             serve: None,
             plant: RunArguments { plant: Some(arguments.plant.clone()), work: Some(taken), truth: None },
             json: arguments.json,
-        })?;
+        });
+        let outcome = match outcome {
+            Ok(outcome) => outcome,
+            Err(error) => {
+                super::super::runtime()?.block_on(return_unbegun(&config, &lease));
+                return Err(error);
+            }
+        };
         // After any other result a person must act before the next blank is ground.
         if outcome != Outcome::Accepted || arguments.once {
             return Ok(outcome);
@@ -139,15 +147,7 @@ enum Next {
 async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failure> {
     let link = open(config).await?;
     nothing_is_open(&link, &arguments.runs).await?;
-    let Some(lease) = Lease::acquire(&link).await? else { return Ok(Next::None) };
-    let (recipe, signed) = match PlantRecipe::pull(&link, &lease.recipe_sha256, &config.approvers).await {
-        Ok(pulled) => pulled,
-        Err(error) => {
-            // Another cell can know the person who signed the recipe.
-            lease.hand_back(&link, &error.to_string()).await?;
-            return Err(error.into());
-        }
-    };
+    let Some((lease, recipe, signed)) = provable(&link, config).await? else { return Ok(Next::None) };
     let path = keep(&arguments.runs, &lease.recipe_sha256, &recipe)?;
     let read = match check::or_show(Recipe::read(&path)) {
         Ok(read) => read,
@@ -170,6 +170,53 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
             lease.hand_back(&link, "no person at the cell confirmed the part").await?;
             super::super::print("the part is given back\n")?;
             Ok(Next::GivenBack)
+        }
+    }
+}
+
+/// Returns the leased part to the queue if no run has begun to make it, for example because another run has the machines.
+/// If the plant cannot be reached, the lease ends by itself.
+async fn return_unbegun(config: &PlantConfig, lease: &Lease) {
+    let returned = async {
+        let link = open(config).await?;
+        let is_begun = StartedPart::all(&link).await?.iter().any(|begun| begun.lease.work == lease.work);
+        if !is_begun {
+            lease.hand_back(&link, "its run did not begin").await?;
+        }
+        Ok::<(), Failure>(())
+    };
+    let _ = returned.await;
+}
+
+/// Leases the next part whose recipe this cell can prove. Returns the lease, the recipe, and the people who signed it. A
+/// part whose recipe cannot be proven goes back to the queue, because another cell can know who signed it. Returns `None`
+/// if no part waits for this cell.
+///
+/// # Errors
+/// The recipe of each waiting part cannot be proven: the reason of the first. The plant cannot be reached.
+async fn provable(
+    link: &DatabaseLink,
+    config: &PlantConfig,
+) -> Result<Option<(Lease, PlantRecipe, Vec<String>)>, PlantError> {
+    let mut refused: Vec<i64> = Vec::new();
+    let mut first = None;
+    loop {
+        let Some(lease) = Lease::acquire(link).await? else { return first.map_or(Ok(None), Err) };
+        if refused.contains(&lease.work) {
+            lease.hand_back(link, "the recipes of all other parts are refused too").await?;
+            return first.map_or(Ok(None), Err);
+        }
+        match PlantRecipe::pull(link, &lease.recipe_sha256, &config.approvers).await {
+            Ok((recipe, signed)) => return Ok(Some((lease, recipe, signed))),
+            Err(error) if error.may_pass() => {
+                lease.hand_back(link, &error.to_string()).await?;
+                return Err(error);
+            }
+            Err(error) => {
+                lease.refuse_recipe(link, &error.to_string()).await?;
+                refused.push(lease.work);
+                first.get_or_insert(error);
+            }
         }
     }
 }

@@ -1,10 +1,11 @@
-//! Maps of heights in the files of instruments: Digital Surf, Wyko, Bruker, Zygo Mx, 4D and Alicona.
+//! Maps of heights in the files of instruments: Digital Surf, Wyko, Bruker, Zygo Mx, 4D, Alicona and Code V.
 //!
 //! Each file has a format; [`super::measured_map`] lists all formats of maps. Rows of a map go from the bottom up; most
 //! instruments write the top row first.
 
 pub(super) mod alicona;
 pub(super) mod bruker;
+pub(super) mod codev_interferogram;
 pub(super) mod digital_surf;
 pub(super) mod hdf5;
 mod hdf5_value;

@@ -218,3 +218,53 @@ fn sql_injection_stays_text() {
     let back = fs::read(plant.path("back").join(run).join("cycle-1/points.csv")).unwrap();
     assert_eq!(back, SQL.as_bytes());
 }
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn enrolment_takes_over_no_role() {
+    let plant = Plant::new();
+    plant.cell("cell-1", &[]);
+    plant.somebody("planner", "planner");
+    let password = || plant.password("cell-1");
+    let signs_in = || plant.asked_by("cell-1", "SELECT name FROM cell") == Ok("cell-1".into());
+    let enrol = |name: &str, more: &[&str]| {
+        let file = format!("{name}.password");
+        let arguments = ["plant", "enrol", name, "--plant", "owner.toml", "--password-file", &file];
+        crate::program::run(&[&arguments[..], more].concat(), plant.home.path())
+    };
+    let first = password();
+    // What is refused leaves the password as it was: that of the file is that of the database.
+    let names = [crate::postgres::OWNER, "postgres", "cell_1"];
+    for (name, more, found) in [
+        ("cell-1", &[][..], "--again"),
+        ("cell-1", &["--as", "reader", "--again"], "is that of a cell"),
+        ("planner", &["--again"], "is that of a planner"),
+        ("cell-2", &["--again"], "leave out --again"),
+        (names[0], &["--as", "reader", "--again"], "did not make"),
+        (names[1], &["--as", "planner"], "did not make"),
+        (names[2], &["--again"], "has the role cell_1 already"),
+    ] {
+        let (code, _, told) = enrol(name, more);
+        assert!(code == 2 && told.contains(found), "{name} {more:?}: {code} {told}");
+        assert!(!plant.path(&format!("{name}.password.new")).exists(), "{name}");
+        assert!(password() == first && signs_in(), "{name} {more:?}");
+    }
+    assert!(plant.asked_by("planner", "SELECT count(*) FROM run").is_ok());
+    // A new password replaces the old one in the file and in the database.
+    assert_eq!(enrol("cell-1", &["--again"]).0, 0);
+    assert!(password() != first && signs_in());
+    let old = plant.postgres.ask_as("cell_1", &first, "regrind", "SELECT 1");
+    assert!(old.is_err(), "{old:?}");
+    // A further key, with the password as it is.
+    let key = "ab".repeat(32);
+    assert!(plant.does(&["plant", "add-key", "cell-1", "--key", &key, "--plant", "owner.toml"]).contains("1 key"));
+    assert_eq!(plant.sql("SELECT count(*) FROM cell_key"), "1");
+    assert!(signs_in());
+    plant.ends(&["plant", "add-key", "cell-9", "--key", &key, "--plant", "owner.toml"], 1);
+    // A cell that was retired comes back.
+    plant.does(&["plant", "retire", "cell-1", "--plant", "owner.toml"]);
+    assert!(!signs_in());
+    assert_eq!(enrol("cell-1", &["--again"]).0, 0);
+    assert!(signs_in());
+    assert_eq!(plant.sql("SELECT count(*) FROM cell_key"), "1", "its keys stay");
+}

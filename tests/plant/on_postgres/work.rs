@@ -306,3 +306,46 @@ fn dead_run_does_not_block_queue() {
     queue(&plant, "SN-1", &[]);
     plant.does(&make);
 }
+
+/// A part that is due first has a recipe that this cell cannot prove: it makes the next one. The others are not held up by
+/// a cell that leases all parts.
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn unprovable_part_and_hoarder_hold_nobody_up() {
+    let plant = Plant::new();
+    let approvers = approved(&plant);
+    cell(&plant, "cell-1", &approvers);
+    cell(&plant, "cell-2", &approvers);
+    fs::write(plant.path("panel.toml"), fs::read_to_string(plant.path("small.toml")).unwrap() + "\n# another one\n")
+        .unwrap();
+    plant.does(&["plant", "propose", "panel.toml", "--plant", "planner.toml"]);
+    ["Ada", "Eve"].iter().for_each(|person| drop(approves(&plant, person, "panel")));
+    let panel = ["plant", "queue", "SN-1", "--recipe", "panel", "--due", "2027-01-01", "--plant", "planner.toml"];
+    plant.does(&panel);
+    queue(&plant, "SN-2", &[]);
+    let state = |serial: &str| plant.sql(&format!("SELECT state FROM work WHERE serial = '{serial}'"));
+    let make = ["work", "--plant", "cell-1.toml", "--once", "--part", "SN-2"];
+    plant.does(&make);
+    assert_eq!([state("SN-1"), state("SN-2")], ["open", "ended"]);
+    // With nothing else in the queue the refusal is told, and is tried again after another signature.
+    let (_, told) = plant.ends(&["work", "--plant", "cell-1.toml", "--once", "--part", "SN-1"], 2);
+    assert!(told.contains("version 1 of panel"), "{told}");
+    approves(&plant, "Bob", "panel");
+    plant.does(&["work", "--plant", "cell-1.toml", "--once", "--part", "SN-1"]);
+    assert_eq!(state("SN-1"), "ended");
+
+    for k in 3..9 {
+        queue(&plant, &format!("SN-{k}"), &[]);
+    }
+    for k in 1..=3 {
+        assert_ne!(plant.asked_by("cell-2", "SELECT id FROM take_work(86400)").unwrap(), "", "{k}");
+    }
+    let refused = plant.asked_by("cell-2", "SELECT id FROM take_work(86400)").unwrap_err();
+    assert!(refused.contains("has 3 parts leased"), "{refused}");
+    plant.does(&["work", "--plant", "cell-1.toml", "--once", "--part", "SN-6"]);
+    assert_eq!(state("SN-6"), "ended");
+
+    // A run that cannot begin, such as that of a second program, gives its part back at once.
+    plant.ends(&["work", "--plant", "cell-1.toml", "--once", "--part", "SN-7", "--cell", "nowhere.toml"], 2);
+    assert_eq!(state("SN-7"), "open");
+}

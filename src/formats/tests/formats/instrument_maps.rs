@@ -172,6 +172,38 @@ fn units_and_wavelengths_of_maps_are_checked() {
     }
 }
 
+/// A grid of Code V by hand: a wave of 0.5 µm has 1000 counts, and one sample was not measured.
+#[test]
+fn grid_of_codev_by_hand() {
+    let text = "! a remark\nA mirror\nGRD 3 3 SUR WVL 0.5 SSZ 1000 NDA -9\n10 20 30\n-40 -9 0\n1 2\n! another\n3\n";
+    let parse = |text: &str, given_mm| parse_map(Path::new("a.int"), text.as_bytes(), given_mm);
+    let points = parse(text, Some(0.25)).unwrap();
+    let at =
+        |x: f64, y: f64| points.iter().find(|p| (p.x - x).hypot(p.y - y) < 1e-12).map(|p| (p.z * 1e9).round() / 1e3);
+    // 10 counts are 5 nm; the first row is the top one.
+    assert_eq!([at(0.0, 0.5), at(0.5, 0.5), at(0.0, 0.25), at(0.5, 0.0)], [5.0, 15.0, -20.0, 1.5].map(Some));
+    assert_eq!((points.len(), at(0.25, 0.25)), (8, None));
+    assert!(matches!(parse(text, None), Err(FormatError::NoLateralScale { .. })));
+    // Without NDA the mark is 32767; a title can be missing.
+    let silent = text.replace(" NDA -9", "").replace("-9", "32767").replace("A mirror\n", "");
+    assert_eq!(parse(&silent, Some(0.25)).unwrap(), points);
+    for (from, to) in [
+        ("GRD 3 3", "GRD 3 2"),
+        ("SUR", "WFR"),
+        ("SUR", "FIL"),
+        ("SUR", ""),
+        ("WVL 0.5", "WVL 500"),
+        ("WVL 0.5 ", ""),
+        ("SSZ 1000", "SSZ 0"),
+        ("SSZ", "XSC"),
+        ("30\n", "30.5\n"),
+        ("\n3\n", "\n"),
+        ("\n3\n", "\n3 4\n"),
+    ] {
+        assert!(parse(&text.replace(from, to), Some(0.25)).is_err(), "{from} {to}");
+    }
+}
+
 /// Returns the place in the file that the error names.
 #[track_caller]
 fn refused_place(name: &str, bytes: &[u8]) -> String {
