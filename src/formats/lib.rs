@@ -79,8 +79,8 @@ pub use persistent_counter::PersistentCounter;
 pub use ply::{PlyFile, parse_ply, read_ply};
 pub use points::{parse_points, read_nominal_points, read_points, read_points_with_notes};
 pub use registration::{
-    DeviationRow, read_deviations, sync_folder, try_writing, write_atomic, write_column, write_deviations,
-    write_json_atomic, write_points, write_private,
+    DeviationRow, PrivateDraft, read_deviations, sync_folder, try_writing, write_atomic, write_column,
+    write_deviations, write_json_atomic, write_points, write_private,
 };
 pub use scanner_cloud::parse_scanner_cloud;
 pub use sdf::{parse_sdf, read_sdf};

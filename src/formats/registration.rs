@@ -144,6 +144,31 @@ pub fn write_private(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
     draft.publish()
 }
 
+/// File for its owner alone that is on the disk, but has not its name yet.
+pub struct PrivateDraft<'p>(Draft<'p>);
+
+impl<'p> PrivateDraft<'p> {
+    /// Writes `bytes` for the file `path`, which stays as it is until [`PrivateDraft::publish`]. Without that, nothing is
+    /// left.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn create(path: &'p Path, bytes: &[u8]) -> Result<Self, FormatError> {
+        let mut draft = Draft::create_private(path)?;
+        draft.write(bytes)?;
+        draft.flush()?;
+        Ok(Self(draft))
+    }
+
+    /// Gives the file its name, in place of an existing file.
+    ///
+    /// # Errors
+    /// A file that cannot be renamed or flushed to the disk.
+    pub fn publish(self) -> Result<(), FormatError> {
+        self.0.publish()
+    }
+}
+
 /// Checks that files can be written to a folder.
 ///
 /// # Errors
@@ -254,12 +279,16 @@ impl<'p> Draft<'p> {
     /// Flushes the bytes of this temporary file to the disk, and renames it to its final name, where it replaces an
     /// existing file. Then flushes the folder, so that the new name is still present after a power failure.
     pub(super) fn publish(mut self) -> Result<(), FormatError> {
-        let failed = self.failed("flushing it to the disk");
-        self.file.flush().map_err(&failed)?;
-        self.file.get_ref().sync_all().map_err(&failed)?;
+        self.flush()?;
         fs::rename(&self.temporary, self.path).map_err(self.failed("renaming it"))?;
         self.published = true;
-        sync_folder(self.path).map_err(failed)
+        sync_folder(self.path).map_err(self.failed("flushing it to the disk"))
+    }
+
+    fn flush(&mut self) -> Result<(), FormatError> {
+        let failed = self.failed("flushing it to the disk");
+        self.file.flush().map_err(&failed)?;
+        self.file.get_ref().sync_all().map_err(&failed)
     }
 }
 

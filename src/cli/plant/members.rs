@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use regrind::formats::{FormatError, write_private};
+use regrind::formats::{PrivateDraft, write_private};
 use regrind::journal::PublicKey;
-use regrind_plant::{NewMember, PlantRole, add_cell_keys, enrol_cell, migrate, retire_cell};
+use regrind_plant::{NewMember, PlantError, PlantRole, add_cell_keys, enrol_cell, migrate, retire_cell};
 use serde_json::json;
 
 use super::super::failure::Failure;
@@ -150,8 +150,8 @@ pub(super) fn enrol(arguments: &ToEnrol) -> Result<Outcome, Failure> {
         let keys: Vec<String> = arguments.key.iter().map(ToString::to_string).collect();
         // The password is on the disk before the database has it, and replaces the old one when the database has it.
         let path = &arguments.password_file;
-        let draft = PathBuf::from(format!("{}.new", path.display()));
-        write_private(&draft, format!("{password}\n").as_bytes())?;
+        let text = format!("{password}\n");
+        let draft = PrivateDraft::create(path, text.as_bytes())?;
         let member = NewMember { name: &arguments.name, role: &role, password: &password, is_again: arguments.again };
         let enrolled = match arguments.role {
             Kind::Cell => enrol_cell(&mut link, member, &keys).await,
@@ -159,20 +159,12 @@ pub(super) fn enrol(arguments: &ToEnrol) -> Result<Outcome, Failure> {
             Kind::Reader => regrind_plant::enrol(&mut link, member, PlantRole::Reader).await,
             Kind::Worker => regrind_plant::enrol(&mut link, member, PlantRole::Worker).await,
         };
-        match &enrolled {
-            // Whether the database has the password is not known: both files stay.
-            Err(error) if error.may_pass() => {}
-            Err(_) => {
-                // Nobody has the password.
-                let _ = std::fs::remove_file(&draft);
-            }
-            Ok(()) => {
-                let unwritable =
-                    |source| FormatError::Unwritable { path: path.clone(), action: "replacing it", source };
-                std::fs::rename(&draft, path).map_err(unwritable)?;
-            }
+        if enrolled.as_ref().is_err_and(PlantError::may_pass) {
+            // Whether the database has the password is not known, so both are kept.
+            write_private(&PathBuf::from(format!("{}.new", path.display())), text.as_bytes())?;
         }
         enrolled?;
+        draft.publish()?;
         let path = path.display();
         super::super::print(&format!("{} signs in as {role}, with the password in {path}\n", arguments.name))?;
         Ok(Outcome::Accepted)
