@@ -21,7 +21,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use regrind::config::PlantConfig;
 use regrind::journal::{Reader, Record, RecordKind, restore, restore_file, sha256_hex};
-use regrind_plant::{DatabaseLink, DatabaseSettings, Replicator, enrol_cell};
+use regrind_plant::{DatabaseLink, DatabaseSettings, NewMember, Replicator, enrol_cell};
 
 const PASSWORD: &str = "for-measuring";
 
@@ -104,7 +104,11 @@ async fn ship(database: &DatabaseSettings, like: &Like, cells: usize, runs: usiz
     for cell in 1..=cells {
         let (name, folder) = (format!("measured-{cell}"), home.path().join(cell.to_string()));
         let role = format!("measured_{cell}");
-        enrol_cell(&mut owner, &name, &role, PASSWORD, &[]).await.unwrap();
+        let member = NewMember { name: &name, role: &role, password: PASSWORD, is_again: false };
+        // A run before this one has left the cell there.
+        if enrol_cell(&mut owner, member, &[]).await.is_err() {
+            enrol_cell(&mut owner, NewMember { is_again: true, ..member }, &[]).await.unwrap();
+        }
         for run in 1..=runs {
             records += like.lay(&folder, &format!("run-{stamp}-{run}"), &format!("SN-{cell}-{run}"));
         }
