@@ -1,5 +1,4 @@
-//! True form of a part: its true deviations from the nominal surface, as the best-fitting position of the part leaves
-//! them.
+//! True form of a part: its true deviations from the nominal surface, without the best-fitting rigid motion.
 //!
 //! The deviations are some micrometres, so the fit is linear: a motion t, r of the part changes the deviation at the
 //! place p with the normal n by n · t + (p × n) · r.

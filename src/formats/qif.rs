@@ -654,6 +654,11 @@ mod tests {
                 "count=\"3\"",
                 "element MeasuredPointSet: expected a count of 2, the number of points, found `3`",
             ),
+            (
+                "<Points>",
+                "<Points count=\"3\">",
+                "element Points: expected a count of 2, the number of points, found `3`",
+            ),
             (">false<", ">perhaps<", "expected true or false"),
             ("<FileUnits>", "<FileUnits><!-- ", "not readable as XML"),
             ("SIUnitName>meter", "SIUnitName>feet", "expected the meter as SIUnitName, found `feet`"),

@@ -586,6 +586,8 @@ fn own_words_of_a_dialect_are_read_and_written() {
     };
     let words = "[words]\naxes = [\"U\", \"V\", \"W\"]\nfeed = \"E\"\n";
     let turned = own("turned.toml", &[("[words]\n", words)]);
+    let centres =
+        own("centres.toml", &[("centre_words = [\"I\", \"J\", \"K\"]", "centre_words = [\"P\", \"Q\", \"S\"]")]);
     let swapped = own("swapped.toml", &[("\"G02 \"", "\"G99 \""), ("\"G03 \"", "\"G02 \""), ("\"G99 \"", "\"G03 \"")]);
     let correct = |dialect: &str, program: &str| {
         fs::write(bench.path("own"), program).unwrap();
@@ -601,6 +603,11 @@ fn own_words_of_a_dialect_are_read_and_written() {
     assert!(refused.contains("X is no word"), "{refused}");
     // With the words of the two senses exchanged, an arc keeps the sense that the dialect gives its word.
     let arc = "%\nO1\nG21 G90 G54 G17\nG00 X0. Y0. Z5.\nG01 Z1. F500.\nG03 X5. Y5. I5. J0.\nM30\n%\n";
+    let about = arc.replace("I5. J0.", "P5. Q0.").replace("G03", "G02");
+    let text = correct(&centres, &about).unwrap();
+    assert!(text.lines().any(|found| found == "G02 X5.0000 Y5.0000 Z0.9960 P5.0000 Q0.0000"), "{text}");
+    let refused = correct(&centres, arc).unwrap_err();
+    assert!(refused.contains("I is no word"), "{refused}");
     let text = correct(&swapped, arc).unwrap();
     assert!(text.lines().any(|found| found == "G03 X5.0000 Y5.0000 Z0.9960 I5.0000 J0.0000"), "{text}");
 }
@@ -699,9 +706,9 @@ fn programs_of_shops_are_corrected_in_their_dialect() {
     let archive = constant("sinumerik", &format!("%_N_MIRROR_MPF\n;$PATH=/_N_WKS_DIR\n{sinumerik}")).unwrap();
     assert!(archive.starts_with("%_N_MIRROR_MPF\n;$PATH=/_N_WKS_DIR\n; Regrind"), "{archive}");
     // G05.1 and G5.1 are one code, and a dwell has the letter of an axis.
-    let fast = fanuc.replace("G01 Z10000", "G5.1 Q1\r\nG04 X2.\r\nG01 Z10000");
+    let fast = fanuc.replace("G01 Z10000", "G5.1 Q1\r\nG04 X2. (COOL)\r\nG01 Z10000");
     let told = lines(&constant("fanuc", &fast).unwrap());
-    assert!(["G5.1 Q1", "G04 X2."].iter().all(|line| told.iter().any(|found| found == line)), "{told:#?}");
+    assert!(["G5.1 Q1", "G04 X2. (COOL)"].iter().all(|line| told.iter().any(|found| found == line)), "{told:#?}");
     let twice = fanuc.replace("M30\r\n%", "M30\r\nO1235\r\nG01 X1.\r\nM30\r\n%");
     assert!(constant("fanuc", &twice).unwrap_err().contains("another program"));
     let unknown = constant("sinumerik", &sinumerik.replace("N30 ", "N30 TRANS X1\nN31 ")).unwrap_err();

@@ -341,12 +341,13 @@ fn run_to_end(mut command: Command) -> Result<(), String> {
         String::from_utf8_lossy(&text).trim_end().to_owned()
     });
     let began = Instant::now();
-    let mut alarm = None;
+    let mut waiting = Waiting::default();
     loop {
         match lines.recv_timeout(MAX_RUN.saturating_sub(began.elapsed())) {
             Ok(line) => {
-                if let Some(reason) = held_reason(&line, &mut alarm) {
-                    return Err(reason);
+                waiting.take_notice(&line);
+                if let (true, Some(alarm)) = (waiting.is_held, &waiting.alarm) {
+                    return Err(format!("the run was held: {alarm}"));
                 }
             }
             Err(RecvTimeoutError::Timeout) => {
@@ -360,23 +361,30 @@ fn run_to_end(mut command: Command) -> Result<(), String> {
         return Ok(());
     }
     let reason = errors.join().unwrap_or_default();
-    let reason = if reason.is_empty() { alarm.unwrap_or_default() } else { reason };
+    let reason = if reason.is_empty() { waiting.alarm.unwrap_or_default() } else { reason };
     Err(if reason.is_empty() { format!("the run ended with {ended}") } else { reason })
 }
 
-/// Returns why a run waits for a person, if `line` of its output says so. `alarm` keeps the last alarm that a person
-/// must acknowledge.
-fn held_reason(line: &str, alarm: &mut Option<String>) -> Option<String> {
-    let notice: Value = serde_json::from_str(line).ok()?;
-    let text = |key: &str| notice[key].as_str();
-    match text("notice")? {
-        "alarm" if text("clears") == Some("operator") => *alarm = text("what").map(ToOwned::to_owned),
-        "state" if text("state")?.starts_with("Held") => {
-            return alarm.take().map(|alarm| format!("the run was held: {alarm}"));
+/// State and alarm of a run, by the lines of its output.
+#[derive(Default)]
+struct Waiting {
+    /// True while the cell is Held.
+    is_held: bool,
+    /// The last alarm that a person must acknowledge.
+    alarm: Option<String>,
+}
+
+impl Waiting {
+    /// Takes one line of the output of `regrind run --json`. The alarm can come before the state or after it.
+    fn take_notice(&mut self, line: &str) {
+        let Ok(notice) = serde_json::from_str::<Value>(line) else { return };
+        let text = |key: &str| notice[key].as_str().unwrap_or_default();
+        match text("notice") {
+            "alarm" if text("clears") == "operator" => self.alarm = Some(text("what").to_owned()),
+            "state" => self.is_held = text("state").starts_with("Held"),
+            _ => {}
         }
-        _ => {}
     }
-    None
 }
 
 /// Process that does not outlive the function that started it. It is simulated whole, and its folder is deleted.
@@ -546,6 +554,23 @@ mod tests {
         }
         assert_eq!(seeds("3..3"), Ok((3, 3)));
         assert!(["", "1", "2..1", "-1..2", "0..1000000"].iter().all(|bad| seeds(bad).is_err()));
+    }
+
+    #[test]
+    fn held_run_waits_for_person_whatever_comes_first() {
+        let alarm = r#"{"notice":"alarm","clears":"operator","what":"No part was found."}"#;
+        let [held, goes_on] = ["Held (Measure, Send)", "Execute (Measure, Run)"]
+            .map(|state| format!(r#"{{"notice":"state","state":"{state}"}}"#));
+        let after = |lines: &[&str]| {
+            let mut waiting = Waiting::default();
+            lines.iter().for_each(|line| waiting.take_notice(line));
+            (waiting.is_held, waiting.alarm.is_some())
+        };
+        assert_eq!(after(&[alarm, &held]), (true, true));
+        assert_eq!(after(&[&held, alarm]), (true, true));
+        assert_eq!(after(&[&held, &goes_on]), (false, false));
+        let by_itself = alarm.replace("operator", "condition");
+        assert_eq!(after(&[&by_itself, &held, "no JSON", "{}"]), (true, false));
     }
 
     #[test]

@@ -35,6 +35,8 @@ pub(super) struct DialectReader<'a> {
     templates: Vec<String>,
     /// The same for the lines before the header.
     frame: Vec<String>,
+    /// Letters of LinuxCNC for the words of the dialect, the longest word first.
+    letters: Vec<(String, char)>,
     inches: bool,
     /// Centre of the next arcs in Klartext: the words, and the plane.
     centre: Option<String>,
@@ -61,7 +63,7 @@ impl<'a> DialectReader<'a> {
             lines.map(|line| squeezed(line)).collect(),
             dialect.program.begin.iter().map(|line| squeezed(line)).collect(),
         );
-        Self { dialect, templates, frame, inches: false, centre: None }
+        Self { dialect, templates, frame, letters: letters_of(dialect), inches: false, centre: None }
     }
 
     /// Reads a line.
@@ -91,7 +93,9 @@ impl<'a> DialectReader<'a> {
                 words.split(' ').fold(self.inches, |inches, word| (word == "G20") || (inches && word != "G21"));
             return Ok(NeutralLine { is_frame, ..NeutralLine::copied(text, words) });
         }
-        let words = if has_g_words(self.dialect) { self.g_words(code)? } else { self.klartext(text, code)? };
+        let words = if has_g_words(self.dialect) { self.g_words(text, code)? } else { self.klartext(text, code)? };
+        // A line that is copied has its comment.
+        let comment = comment.filter(|_| words.copied.is_none());
         let comment = comment.map_or(String::new(), |words| format!(" ;{words}"));
         Ok(NeutralLine { words: words.words + &comment, ..words })
     }
@@ -142,7 +146,7 @@ impl<'a> DialectReader<'a> {
     }
 
     /// Reads words of letters and numbers.
-    fn g_words(&mut self, code: &str) -> Result<NeutralLine, Refusal> {
+    fn g_words(&mut self, text: &str, code: &str) -> Result<NeutralLine, Refusal> {
         if code.contains(['(', ')']) {
             return Err((
                 "brackets call a function of the control".into(),
@@ -150,13 +154,13 @@ impl<'a> DialectReader<'a> {
             ));
         }
         let upper = code.to_ascii_uppercase();
-        let plain = plain_words(&upper, self.dialect)?;
+        let plain = plain_words(&upper, &self.letters)?;
         let block = block(&plain).map_err(|refusal| self.unknown_word(&upper).unwrap_or(refusal))?;
         // A dwell in seconds, which Fanuc names by the letter of an axis.
         let is_dwell = block.words.iter().any(|word| word.letter == b'G' && word.value == 4.0);
         if is_dwell && block.words.iter().all(|word| matches!(word.letter, b'G' | b'X' | b'P' | b'F' | b'S')) {
             return match block.words.iter().filter(|word| word.letter == b'G').count() {
-                1 => Ok(NeutralLine::copied(code, "")),
+                1 => Ok(NeutralLine::copied(text, "")),
                 _ => Err(("a dwell stands with other G words".into(), "write G4 in a line of its own")),
             };
         }
@@ -182,7 +186,8 @@ impl<'a> DialectReader<'a> {
     /// Returns the refusal of the first word of a line that is not a letter with a number.
     fn unknown_word(&self, upper: &str) -> Option<Refusal> {
         let is_unknown = |token: &&str| {
-            plain_words(token, self.dialect).is_ok_and(|plain| block(&plain).is_err()) && !token.starts_with(['/', '#'])
+            plain_words(token, &self.letters).is_ok_and(|plain| block(&plain).is_err())
+                && !token.starts_with(['/', '#'])
         };
         let token = upper.split_whitespace().find(is_unknown)?;
         let remedy = "remove it if it does not move the tool, or write it into `setup` of a dialect of your own";
@@ -269,12 +274,13 @@ fn letters_of(dialect: &Dialect) -> Vec<(String, char)> {
     letters
 }
 
-/// Returns a line, in capital letters, with the letters of LinuxCNC in place of the words of a dialect.
+/// Returns a line, in capital letters, with the letters of LinuxCNC in place of the words of a dialect, as [`letters_of`]
+/// gives them.
 ///
 /// # Errors
 /// The letter of an axis, of a centre or of the feed that is no word of the dialect.
-fn plain_words(upper: &str, dialect: &Dialect) -> Result<String, Refusal> {
-    let letters = letters_of(dialect);
+fn plain_words(upper: &str, letters: &[(String, char)]) -> Result<String, Refusal> {
+    let has_centres = letters.iter().any(|(_, letter)| *letter == 'I');
     let mut plain = String::with_capacity(upper.len());
     let mut rest = upper;
     while let Some(first) = rest.chars().next() {
@@ -288,9 +294,11 @@ fn plain_words(upper: &str, dialect: &Dialect) -> Result<String, Refusal> {
                 plain.push(letter);
                 rest = behind;
             }
-            None if matches!(first, 'X' | 'Y' | 'Z' | 'F') && is_value(&rest[1..]) => {
+            None if (matches!(first, 'X' | 'Y' | 'Z' | 'F') || (has_centres && matches!(first, 'I' | 'J' | 'K')))
+                && is_value(&rest[1..]) =>
+            {
                 let remedy = "write the words that the dialect's file has, or correct that file";
-                return Err((format!("{first} is no word of an axis or of the feed in this dialect"), remedy));
+                return Err((format!("{first} is no word of an axis, a centre or the feed in this dialect"), remedy));
             }
             None => {
                 plain.push(first);

@@ -36,7 +36,7 @@ const OF_SURFACES: [&str; 27] = [
     "RDX", "CUX", "SLB", "CIR", "REX", "REY", "ADX", "ADY", "ARO", "ELX", "ELY",
 ];
 
-/// Statements that change surfaces that are there already: what they leave is not read.
+/// Statements that change earlier surfaces. Their effect is not read, so they are refused.
 const CHANGES: [&str; 9] = ["SCA", "DEL", "INS", "FLY", "COP", "MOV", "INT", "IN", "RES"];
 
 /// Surface as the file has it.

@@ -178,7 +178,7 @@ impl Block {
             "ELAP" => self.outline = Outline::Ellipse(pair()?),
             "USAP" => self.outline = Outline::Unknown,
             "OBDC" => self.centre = pair()?,
-            // OpticStudio does not write it, but who edits a file by hand does.
+            // OpticStudio writes the curvature. A person who edits a file by hand may write the radius.
             "RADI" | "RADIUS" => return Err(line.wrong("CURV, the curvature")),
             _ => {}
         }
@@ -211,8 +211,8 @@ impl Block {
         }
     }
 
-    /// Checks that the surface has no parameter, and no extra data, that its type does not use, and that the last of its
-    /// extra data is there. Where values stand of which the meaning is not known, the surface is not known.
+    /// Checks that the surface has no parameter and no extra data that its type does not use, because their meaning is not
+    /// known. Checks that the last of its extra data is there.
     fn check_parameters(&self) -> Result<(), String> {
         let kind = &self.kind[..];
         let is_used = |index: u32| match kind {

@@ -96,10 +96,11 @@ fn parse_interferogram(path: &Path, bytes: &[u8], given_mm: Option<f64>) -> Resu
             let value = word.parse::<f64>().ok().filter(|value| value.fract() == 0.0 && value.abs() <= 1e9);
             let value =
                 value.ok_or_else(|| unexpected(path, &format!("line {}", number + 1), "a whole number", word))?;
+            if heights.len() == size * size {
+                let expected = format!("{size} x {size} counts");
+                return Err(unexpected(path, &format!("line {}", number + 1), &expected, "more"));
+            }
             heights.push((value != mark).then_some(value * count_mm));
-        }
-        if heights.len() > size * size {
-            return Err(unexpected(path, &format!("line {}", number + 1), &format!("{size} x {size} counts"), "more"));
         }
     }
     if heights.len() != size * size {

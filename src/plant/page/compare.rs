@@ -103,9 +103,10 @@ async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Resul
         let Some(cell) = cells.last_mut() else { continue };
         let (cycles, result): (Option<i32>, Option<&str>) = (row.get(2), row.get(3));
         let given_up = row.get::<_, Option<bool>>(4) == Some(true);
-        let Some(result) = result.or(given_up.then_some("open")).filter(|result| *result != "open" || given_up) else {
+        let result = result.unwrap_or("open");
+        if result == "open" && !given_up {
             continue;
-        };
+        }
         cell.ended += 1;
         // The figures of an unfinished part say nothing of the cell.
         let is_finished = matches!(result, "accepted" | "not accepted");

@@ -233,7 +233,7 @@ fn enrolment_takes_over_no_role() {
         crate::program::run(&[&arguments[..], more].concat(), plant.home.path())
     };
     let first = password();
-    // What is refused leaves the password as it was: that of the file is that of the database.
+    // A refused enrolment changes neither the password file nor the database.
     let names = [crate::postgres::OWNER, "postgres", "cell_1"];
     for (name, more, found) in [
         ("cell-1", &[][..], "--again"),

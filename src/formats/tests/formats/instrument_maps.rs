@@ -172,6 +172,34 @@ fn units_and_wavelengths_of_maps_are_checked() {
     }
 }
 
+/// 1e38 in 32 bits is 9.9999997e37, and marks a sample as well as the next larger number does.
+#[test]
+fn mark_in_32_bits_is_no_height() {
+    let name = "opd-float32.opd";
+    let plain = std::fs::read(folder().join(name)).unwrap();
+    let marked = replaced(&plain, &1.000_000_1e38f32.to_le_bytes(), &1e38f32.to_le_bytes());
+    assert_ne!(marked, plain);
+    let parse = |bytes: &[u8]| parse_map(Path::new(name), bytes, None).unwrap();
+    assert_eq!(parse(&marked), parse(&plain));
+}
+
+#[test]
+fn unknown_flags_and_contradicting_fields_are_refused() {
+    let text = |name: &str| std::fs::read_to_string(folder().join(name)).unwrap();
+    let wyko = text("wyko-waves.asc");
+    for (from, to, is_read) in [("Format 0\t0\t1", "Format 0\t0\t1", true), ("Format 0\t0\t1", "Format 0\t2\t1", false)]
+    {
+        let parsed = parse_map(Path::new("a.asc"), wyko.replace(from, to).as_bytes(), None);
+        assert_eq!(parsed.is_ok(), is_read, "{to}");
+    }
+    let sdf = text("surfalize-iso1-text.sdf");
+    for (again, is_read) in [("Zscale = 1e-08", true), ("Zscale = 1e-07", false)] {
+        let twice = sdf.replace("Zscale = 1e-08", &format!("Zscale = 1e-08\n{again}"));
+        assert_ne!(twice, sdf);
+        assert_eq!(parse_map(Path::new("a.sdf"), twice.as_bytes(), None).is_ok(), is_read, "{again}");
+    }
+}
+
 /// A grid of Code V by hand: a wave of 0.5 µm has 1000 counts, and one sample was not measured.
 #[test]
 fn grid_of_codev_by_hand() {
