@@ -454,10 +454,13 @@ fn unproven_run_gives_no_report() {
     plant.sql("UPDATE cycle SET pv_um = 0.5 WHERE cycle = 1");
     {
         let said = words(&until_proven(&ServedPage::serve(&plant), "/runs/1"));
-        assert!(said.contains("The report of the cell differs") && said.contains("pv_um of cycle 1 is 0.5"), "{said}");
+        assert!(
+            said.contains("The report of the cell differs") && said.contains("PV of cycle 1 is 0.500 µm"),
+            "{said}"
+        );
         let run = folder.display().to_string();
         let (_, told) = plant.ends(&["audit", "verify", &run, "--plant", "cell-1.toml"], 1);
-        assert!(told.contains("pv_um of cycle 1"), "{told}");
+        assert!(told.contains("PV of cycle 1"), "{told}");
     }
     plant.sql(&format!("UPDATE cycle SET pv_um = {was} WHERE cycle = 1"));
     // A copy without its end: the last records are covered by no signature.
