@@ -11,6 +11,7 @@
 
 use rayon::prelude::*;
 
+use super::delaunay::triangulate;
 use super::error::SurfaceError;
 use super::facet::FacetIndex;
 use super::facet::Side;
@@ -164,10 +165,13 @@ impl ErrorEstimate {
 /// # Errors
 /// Returns an error if the points do not form a surface, or if there are too few points to withhold most of them.
 pub fn estimate_accuracy(samples: NominalPoints) -> Result<Accuracy, SurfaceError> {
+    let of_all = |error, points: &[Point]| too_few_of_all(error, points.iter().filter(|p| p.x.is_finite()).count());
     let (points, [factor, coarsest], [mut fine, mut coarse]) = match samples {
         NominalPoints::Grid { columns, rows, points, normals } => {
             check_grid(columns, rows, points.len().min(normals.len()))?;
-            let level = |stride| strided_grid_errors(columns, rows, points, normals, stride);
+            let level = |stride| {
+                strided_grid_errors(columns, rows, points, normals, stride).map_err(|error| of_all(error, points))
+            };
             (points, GRID_STRIDES.map(|stride| stride as f64), [level(GRID_STRIDES[0])?, level(GRID_STRIDES[1])?])
         }
         NominalPoints::Points { points, projection } => {
@@ -176,22 +180,18 @@ pub fn estimate_accuracy(samples: NominalPoints) -> Result<Accuracy, SurfaceErro
                 return Err(SurfaceError::NotFinite { index });
             }
             let (factors, kept) = choose_coarse_points(points, projection)?;
-            (
-                points,
-                factors,
-                [subset_errors(points, &kept[0], projection)?, subset_errors(points, &kept[1], projection)?],
-            )
+            let level = |kept: &[u32]| subset_errors(points, kept, projection).map_err(|error| of_all(error, points));
+            (points, factors, [level(&kept[0])?, level(&kept[1])?])
         }
     };
     let count = points.iter().filter(|p| p.x.is_finite()).count();
-    let least = count.max(1).saturating_mul(4);
     let is_border = [&fine, &coarse].iter().any(|errors| errors.inside.len() < MIN_INSIDE);
     if is_border {
         // With few points nearly all places are near the border, so the estimate includes the border.
         [&mut fine, &mut coarse].into_iter().for_each(WithheldErrors::merge_border);
     }
     if [&fine, &coarse].iter().any(|errors| errors.inside.len() < MIN_INSIDE) {
-        return Err(SurfaceError::TooFewPoints { points: count, min_points: least });
+        return Err(too_few(count));
     }
     let spacing_mm = fine.spacing_mm / factor;
     let [flat, curved] = [0, 1].map(|kind| {
@@ -204,6 +204,22 @@ pub fn estimate_accuracy(samples: NominalPoints) -> Result<Accuracy, SurfaceErro
         ErrorEstimate { reliability: trust, ..told }
     });
     Ok(Accuracy { points: count, spacing_mm, flat, curved })
+}
+
+/// Returns the error of `points` points in place of the error of a coarser sampling that is too small for a surface. The
+/// size of that sampling means nothing to the caller, who has all points.
+fn too_few_of_all(error: SurfaceError, points: usize) -> SurfaceError {
+    match error {
+        SurfaceError::TooFewPoints { .. }
+        | SurfaceError::Collinear { .. }
+        | SurfaceError::GridSize { .. }
+        | SurfaceError::NoTriangles => too_few(points),
+        other => other,
+    }
+}
+
+fn too_few(points: usize) -> SurfaceError {
+    SurfaceError::TooFewPoints { points, min_points: points.max(1).saturating_mul(4) }
 }
 
 /// Errors at the points that a coarser sampling withholds.
@@ -262,8 +278,8 @@ fn coarse_nodes(columns: usize, rows: usize, stride: usize) -> impl Iterator<Ite
 /// one in 16, or one in 2 and one in 4 if there are fewer than 600 points.
 ///
 /// # Errors
-/// Returns an error if points that form no grid are fewer than 9, lie on one line, or have no one-to-one projection to
-/// a plane.
+/// Returns an error if points that form no grid are fewer than 9, lie on one line, have no one-to-one projection to a
+/// plane, or cannot be triangulated there.
 fn choose_coarse_points(
     points: &[Point],
     projection: PlaneProjection,
@@ -283,6 +299,8 @@ fn choose_coarse_points(
         return Err(SurfaceError::Collinear { points: points.len() });
     }
     let (_, map) = projection.choose(points)?;
+    // A coarser sampling may leave out one of two duplicates. All points must form a surface.
+    triangulate(points, &map)?;
     let order = morton_order(points, &map);
     let of = if points.len() < FEW_POINTS { THINNING_FACTORS_OF_FEW } else { THINNING_FACTORS };
     let every = |one_of: usize| order.iter().copied().skip(one_of.isqrt() / 2).step_by(one_of).collect();

@@ -119,10 +119,17 @@ fn accuracy_refuses_degenerate_points() {
         estimate_accuracy(NominalPoints::Points { points, projection: PlaneProjection::Auto }).unwrap_err()
     };
     assert!(matches!(of(&[]), SurfaceError::TooFewPoints { .. }));
-    assert!(matches!(of(&free_form(9, 9)), SurfaceError::TooFewPoints { .. }));
+    // The coarser samplings have too few nodes, or lie on one line. The error is that of the whole list.
+    assert_eq!(of(&free_form(9, 9)), SurfaceError::TooFewPoints { points: 81, min_points: 324 });
+    assert_eq!(of(&free_form(5, 100)), SurfaceError::TooFewPoints { points: 500, min_points: 2000 });
     let line: Vec<Point> = (0..100).map(|k| Point::new(f64::from(k), 0.0, 0.0)).collect();
     assert!(matches!(of(&line), SurfaceError::Collinear { .. }));
     let mut points = free_form(61, 41);
     points[7].z = f64::NAN;
     assert!(matches!(of(&points), SurfaceError::NotFinite { index: 7 }));
+    // Each of them is in a coarser sampling of 200 points, whichever points are kept there.
+    let mut points = scattered(20, 10);
+    points.extend_from_within(..);
+    let SurfaceError::DuplicatePoints { first, second, at } = of(&points) else { panic!("not duplicates") };
+    assert_eq!((second - first, [points[first].x, points[first].y, points[first].z]), (200, at));
 }
