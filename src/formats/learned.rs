@@ -9,7 +9,7 @@ use super::FormatError;
 use super::run_files::RunFile;
 use super::whole::read_whole;
 use regrind_core::compensation::{
-    Correction, LearningState, MachineSimilarity, ParameterCorrections, TransferredState,
+    Correction, LearningState, MachineSimilarity, ParameterCorrections, TransferredState, contradicting_machines,
 };
 use regrind_core::model::PartPriors;
 
@@ -151,6 +151,12 @@ impl Learned {
         let taught_by = Some(KnowledgeOrigin { runs, machine_difference: differ, comparisons: alike.comparisons() });
         let learned = Self::new(simulation, setting, named.join(" and "), correction, known);
         Some(Self { origin: taught_by, ..learned.with_fields(PartPriors::pooled(&fields)) })
+    }
+
+    /// Returns, for each of `others`, true if its learned error contradicts those of most others
+    /// ([`contradicting_machines`]). All must be for the same kind of parts, each from another cell.
+    pub fn contradicting(others: &[(CellRun, Self)]) -> Vec<bool> {
+        contradicting_machines(&others.iter().map(|(_, other)| &other.known).collect::<Vec<_>>())
     }
 
     /// Returns this knowledge of a run with `kind` stored in it. `kind` is a text of those settings of the run that do

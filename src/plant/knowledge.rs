@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use data_encoding::HEXLOWER;
 use regrind_formats::run_files::RunFile;
 use regrind_formats::{CellRun, Learned, SettingIdentity};
-use regrind_journal::sha256_hex;
+use regrind_journal::{Excerpt, PublicKey, sha256_hex};
 use serde::Deserialize;
 use tokio_postgres::Row;
 use tokio_postgres::types::ToSql;
@@ -65,7 +65,8 @@ impl Knowledge {
     ) -> Result<Self, PlantError> {
         let failed = refused("the learned errors of other cells");
         let mut knowledge = Self::default();
-        let text = "SELECT $1::text, false, cell, run, sha256, content, place FROM lessons($1, $2)";
+        let text =
+            "SELECT $1::text, false, cell, run, sha256, content, place, before, texts, keys FROM lessons($1, $2)";
         // A cell with results of this version and of an earlier one is asked for those of this version.
         for kind in [&kind.id, &kind.earlier] {
             let mut rows = link.client().query(text, &[kind, &simulation]).await.map_err(&failed)?;
@@ -74,10 +75,12 @@ impl Knowledge {
             let of_kind = knowledge.verify_results(link, artefacts, (rows, simulation)).await?;
             knowledge.results.extend(of_kind.into_iter().map(|given| (given.from, given.learned)));
         }
+        knowledge.leave_out_contradicting(link).await?;
         if knowledge.results.is_empty() {
             return Ok(knowledge);
         }
-        let text = "SELECT kind, is_own, cell, run, sha256, content, place FROM lessons_in_common($1)";
+        let text =
+            "SELECT kind, is_own, cell, run, sha256, content, place, before, texts, keys FROM lessons_in_common($1)";
         let rows = link.client().query(text, &[&simulation]).await.map_err(&failed)?;
         let in_common = knowledge.verify_results(link, artefacts, (rows, simulation)).await?;
         for (k, one) in in_common.iter().enumerate() {
@@ -105,16 +108,39 @@ impl Knowledge {
             let (cell, run): (String, String) = (row.get(2), row.get(3));
             match read_result(&row, artefacts, simulation) {
                 Ok(given) => believed.push(given),
-                Err(reason) => {
-                    let words = format!("the learned error of {run} of {cell} is ignored: {reason}");
-                    let values: [&(dyn ToSql + Sync); 3] = [&run, &"a lesson refused", &words];
-                    let told = link.client().query_one("SELECT complain($1, $2, $3)", &values).await;
-                    told.map_err(refused("the report of a problem"))?;
-                    self.skipped.push(words);
-                }
+                Err(reason) => self.refuse(link, &CellRun { cell, run }, &reason).await?,
             }
         }
         Ok(believed)
+    }
+
+    /// Removes the results that contradict those of most other cells, and reports each to the plant. Of two cells that
+    /// contradict each other, none teaches.
+    ///
+    /// Returns an error if the plant cannot be reached.
+    async fn leave_out_contradicting(&mut self, link: &DatabaseLink) -> Result<(), PlantError> {
+        let contradicting = Learned::contradicting(&self.results);
+        for ((from, learned), contradicts) in std::mem::take(&mut self.results).into_iter().zip(contradicting) {
+            match contradicts {
+                false => self.results.push((from, learned)),
+                true => {
+                    self.refuse(link, &from, "it contradicts what most other cells have learned of such parts").await?
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Reports to the plant that the result `from` is not used, and adds the reason to `skipped`.
+    ///
+    /// Returns an error if the plant cannot be reached.
+    async fn refuse(&mut self, link: &DatabaseLink, from: &CellRun, reason: &str) -> Result<(), PlantError> {
+        let words = format!("the learned error of {} of {} is ignored: {reason}", from.run, from.cell);
+        let values: [&(dyn ToSql + Sync); 3] = [&from.run, &"a lesson refused", &words];
+        let told = link.client().query_one("SELECT complain($1, $2, $3)", &values).await;
+        told.map_err(refused("the report of a problem"))?;
+        self.skipped.push(words);
+        Ok(())
     }
 }
 
@@ -139,10 +165,27 @@ fn read_result(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool
     if sha256_hex(&content) != HEXLOWER.encode(sha256) {
         return Err("it differs from the record".into());
     }
+    check_signature(row, &from.run)?;
     let place: PathBuf = [&from.cell, &from.run, RunFile::Learned.name()].iter().collect();
     let stated = SettingIdentity { id: kind.clone(), earlier: kind.clone() };
     let learned = Learned::read_other(&place, &content, &stated, simulation).map_err(|error| error.to_string())?;
     Ok(DeliveredResult { kind, is_own, from, learned })
+}
+
+/// Checks that the cell has signed the result in `row`: the last records of its run name the file `learned.json` with the
+/// SHA-256 hash in `row`, and end with a seal that one of the keys of the cell has made. `run` is the name of the run.
+///
+/// Returns the reason as a text if this is not proven.
+fn check_signature(row: &Row, run: &str) -> Result<(), String> {
+    let sha256 = HEXLOWER.encode(row.get(4));
+    let before = HEXLOWER.encode(row.get(7));
+    let texts: Vec<String> = row.get(8);
+    let keys: Vec<PublicKey> = row.get::<_, Vec<String>>(9).iter().filter_map(|key| key.parse().ok()).collect();
+    let files = Excerpt { run, before: &before, texts: &texts }.verify(&keys).map_err(|error| error.to_string())?;
+    match files.iter().any(|file| file.name == RunFile::Learned.name() && file.sha256 == sha256) {
+        true => Ok(()),
+        false => Err("the signed records do not name its file".into()),
+    }
 }
 
 /// Reads a file. Returns an error if it is longer than [`MAX_BYTES`].

@@ -27,7 +27,7 @@ pub use replication::{ReplicationResult, Replicator, run_overview};
 pub use reported::Reported;
 pub use schema::{NewMember, PlantRole, add_cell_keys, check_layout, enrol, enrol_cell, migrate, retire_cell};
 pub use settings::{Approver, ArtefactSettings, DatabaseSettings};
-pub use studies::{LeasedRun, Study};
+pub use studies::{LeasedRun, RENEWAL, Study};
 pub use tokio_postgres::Row;
 pub use tokio_postgres::types::ToSql;
 pub use work::{LEASE, Lease, StartedPart};

@@ -150,28 +150,60 @@ impl PlantRecipe {
         })
     }
 
-    /// Signs the recipe with `key` in the name of `person`, and stores the signature in the plant.
+    /// Signs the recipe with `key` in the name of `person`, and stores the signature in the plant. If `is_replacing` is
+    /// true, the signature replaces an earlier one of this key, whose name was wrong, and it is stored even if another
+    /// key has signed for this person. A cell counts only the names and keys in its own plant file.
     ///
     /// # Errors
     /// Fails if this person has signed the recipe already, or if somebody has signed it with this key. Also fails if
     /// the database role has no right to sign, or if the plant cannot be reached.
-    pub async fn approve(&self, link: &DatabaseLink, person: &str, key: &AuditKey) -> Result<(), PlantError> {
+    pub async fn approve(
+        &self,
+        link: &DatabaseLink,
+        person: &str,
+        key: &AuditKey,
+        is_replacing: bool,
+    ) -> Result<(), PlantError> {
         let sha256 = self.sha256();
         let signature = key.sign(words(&sha256, person).as_bytes());
-        let (bytes, key) = (HEXLOWER.decode(sha256.as_bytes()).unwrap_or_default(), key.public().to_string());
-        let text = "INSERT INTO approval (recipe, person, key, signature) VALUES ($1, $2, $3, $4)";
-        let put = link.client().execute(text, &[&bytes, &person, &key, &signature]).await;
-        match put {
-            Err(error) if error.code() == Some(&tokio_postgres::error::SqlState::UNIQUE_VIOLATION) => {
-                let Self { name, version, .. } = self;
-                let what = format!(
-                    "version {version} of {name} is already signed by {person} or with this key; another person must \
-                     sign it"
-                );
-                Err(PlantError::Recipe(what))
+        let (bytes, own) = (HEXLOWER.decode(sha256.as_bytes()).unwrap_or_default(), key.public().to_string());
+        let values: [&(dyn ToSql + Sync); 5] = [&bytes, &person, &own, &signature, &is_replacing];
+        let text = "SELECT person, key FROM sign_recipe($1, $2, $3, $4, $5)";
+        let Some(row) = link.client().query_opt(text, &values).await.map_err(refused("the signature"))? else {
+            return Ok(());
+        };
+        let (signer, by): (&str, &str) = (row.get(0), row.get(1));
+        let Self { name, version, .. } = self;
+        Err(PlantError::Recipe(match (signer == person, by == own) {
+            (true, true) => {
+                format!(
+                    "version {version} of {name} is already signed by {person} with this key; another person must sign it"
+                )
             }
-            other => other.map(drop).map_err(refused("the signature")),
-        }
+            (_, true) => format!(
+                "version {version} of {name} is already signed by {signer} with this key; if that name was wrong, replace \
+                 the signature: --replace"
+            ),
+            (_, false) => format!(
+                "version {version} of {name} is already signed by {person} with another key; another person must sign it, \
+                 or, if that key is not the key of {person}: --replace"
+            ),
+        }))
+    }
+
+    /// Withdraws the version `version` of the recipe `name`: no cell begins a part by it any more. Removes the parts that
+    /// wait for it from the queue, and returns their serial numbers. Returns `None` if there is no such recipe, or if it
+    /// is withdrawn already. `reason` is the reason, which the plant stores.
+    ///
+    /// # Errors
+    /// Fails if the database role has no right to withdraw recipes, or if the plant cannot be reached.
+    pub async fn withdraw(
+        link: &DatabaseLink,
+        (name, version): (&str, i32),
+        reason: &str,
+    ) -> Result<Option<Vec<String>>, PlantError> {
+        let row = link.client().query_one("SELECT withdraw_recipe($1, $2, $3)", &[&name, &version, &reason]).await;
+        Ok(row.map_err(refused("the withdrawal"))?.get(0))
     }
 
     /// Fetches the recipe with the hash `sha256` from the plant and verifies it. `approvers` is the list of people and

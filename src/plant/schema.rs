@@ -6,7 +6,7 @@ use super::error::{PlantError, refused};
 use super::link::DatabaseLink;
 
 /// All versions of the layout, each as a migration from the one before. A published migration never changes.
-const MIGRATIONS: [(i32, &str); 8] = [
+const MIGRATIONS: [(i32, &str); 9] = [
     (1, include_str!("migrations/0001_records.sql")),
     (2, include_str!("migrations/0002_work.sql")),
     (3, include_str!("migrations/0003_views.sql")),
@@ -15,6 +15,7 @@ const MIGRATIONS: [(i32, &str); 8] = [
     (6, include_str!("migrations/0006_knowledge.sql")),
     (7, include_str!("migrations/0007_yield.sql")),
     (8, include_str!("migrations/0008_queue.sql")),
+    (9, include_str!("migrations/0009_limits.sql")),
 ];
 
 /// Groups of roles. Each role that signs in is a member of one group.

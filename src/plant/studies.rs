@@ -9,8 +9,11 @@ use tokio_postgres::types::ToSql;
 use super::error::{PlantError, refused};
 use super::link::DatabaseLink;
 
-/// Duration of the lease of a job. A run takes seconds; for a large part, minutes.
-const LEASE: Duration = Duration::from_secs(1800);
+/// Duration of the lease of a job. A worker renews the lease while it makes the run, so the job of a worker that died is
+/// free again after this time.
+const LEASE: Duration = Duration::from_secs(60);
+/// Time between two renewals of the lease of a job.
+pub const RENEWAL: Duration = Duration::from_secs(15);
 
 /// Recipe of a study.
 #[derive(Clone, Debug, PartialEq)]
@@ -82,15 +85,14 @@ impl Study {
 }
 
 impl LeasedRun {
-    /// Leases the next free job, from the oldest study first, for 30 minutes. A job whose lease has ended without a
+    /// Leases the next free job, from the oldest study first, for one minute. A job whose lease has ended without a
     /// result is free again, up to three leases in total. Returns `None` if no job is free.
     ///
     /// # Errors
     /// Fails if this computer did not sign in as a worker, or if the plant cannot be reached.
     pub async fn lease_next(link: &DatabaseLink) -> Result<Option<Self>, PlantError> {
-        let seconds = i32::try_from(LEASE.as_secs()).unwrap_or(i32::MAX);
         let text = "SELECT study, job, lease, varied::text, seed FROM take_job($1)";
-        let row = link.client().query_opt(text, &[&seconds]).await.map_err(refused("a job"))?;
+        let row = link.client().query_opt(text, &[&seconds()]).await.map_err(refused("a job"))?;
         Ok(row.map(|row| Self {
             study: row.get(0),
             number: row.get(1),
@@ -98,6 +100,16 @@ impl LeasedRun {
             varied: serde_json::from_str(row.get(3)).unwrap_or_default(),
             seed: row.get::<_, i64>(4).cast_unsigned(),
         }))
+    }
+
+    /// Extends the lease, so that it ends one minute from now. Returns false if this lease of the job is no longer valid.
+    ///
+    /// # Errors
+    /// Fails if the plant cannot be reached.
+    pub async fn renew(&self, link: &DatabaseLink) -> Result<bool, PlantError> {
+        let values: [&(dyn ToSql + Sync); 4] = [&self.study, &self.number, &self.lease, &seconds()];
+        let row = link.client().query_one("SELECT renew_job($1, $2, $3, $4)", &values).await;
+        Ok(row.map_err(refused("the lease of a job"))?.get(0))
     }
 
     /// Stores the result of this job in the plant. `result` is the result of the simulated run, or the reason why there
@@ -116,4 +128,9 @@ impl LeasedRun {
         let row = link.client().query_one(text, &values).await.map_err(refused("the result of a job"))?;
         Ok(row.get(0))
     }
+}
+
+/// Returns the duration of a lease in seconds.
+fn seconds() -> i32 {
+    i32::try_from(LEASE.as_secs()).unwrap_or(i32::MAX)
 }

@@ -4,7 +4,7 @@ use clap::{Args, Subcommand};
 
 use super::super::Outcome;
 use super::super::failure::Failure;
-use super::{members, queue, recipes, runs, serve};
+use super::{members, queue, quota, recipes, runs, serve};
 
 /// Manage the database of a plant of many cells
 #[derive(Args, Debug)]
@@ -30,6 +30,7 @@ enum PlantCommand {
     Enrol(members::ToEnrol),
     AddKey(members::ToAddKey),
     Retire(members::ToRetire),
+    Quota(quota::ToSet),
     Cells(members::ToList),
     Runs(runs::ToList),
     Fetch(runs::ToFetch),
@@ -50,6 +51,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         PlantCommand::Enrol(of) => members::enrol(of),
         PlantCommand::AddKey(of) => members::add_key(of),
         PlantCommand::Retire(of) => members::retire(of),
+        PlantCommand::Quota(of) => quota::run(of),
         PlantCommand::Cells(of) => members::list(of),
         PlantCommand::Runs(of) => runs::list(of),
         PlantCommand::Fetch(of) => runs::fetch(of),

@@ -12,6 +12,7 @@ mod plant_file;
 mod processes;
 mod publish;
 mod queue;
+mod quota;
 mod recipes;
 mod replicate;
 mod run_arguments;

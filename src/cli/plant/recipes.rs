@@ -10,6 +10,7 @@ use regrind_plant::{Approval, PlantError, PlantRecipe};
 use serde_json::json;
 
 use super::super::failure::Failure;
+use super::super::words::counted;
 use super::super::{Outcome, check, name};
 use super::failure::PlantFailure;
 use super::plant_file::{Where, open};
@@ -42,7 +43,8 @@ pub(super) struct ToPropose {
 #[command(after_help = "\
 The key belongs to one person (`regrind audit key --key FILE` creates one). The plant file of each cell has the
 public half of the key in `[[approver]]`, with the name of the person. With this key the cell verifies the signature
-itself. The signature covers one hash of name, version, text and files.
+itself. The signature covers one hash of name, version, text and files. A name that was typed wrongly costs no version: sign
+again with the right one and --replace.
 
 Example:
   regrind plant approve freeform-mirror --person \"A. Smith\" --key smith.key --plant planner.toml
@@ -65,6 +67,9 @@ pub(super) struct ToApprove {
     /// Print the recipe, and sign nothing
     #[arg(long)]
     look: bool,
+    /// Replace the signature of this key, because its name was wrong
+    #[arg(long, conflicts_with = "look")]
+    replace: bool,
     #[command(flatten)]
     plant: Where,
 }
@@ -72,6 +77,9 @@ pub(super) struct ToApprove {
 /// Withdraw a recipe: cells start no further part by it
 #[derive(Args, Debug)]
 #[command(after_help = "\
+The parts that wait for this version leave the queue, and the command lists them. The text can come back under the same
+name, as the next version, which two people sign anew.
+
 Example:
   regrind plant withdraw freeform-mirror --version 3 --reason \"wrong radius of the wheel\" --plant planner.toml
 
@@ -169,7 +177,7 @@ pub(super) fn approve(arguments: &ToApprove) -> Result<Outcome, Failure> {
             super::super::print(&regrind::document::visible(&recipe.text))?;
             return Ok(Outcome::Accepted);
         }
-        recipe.approve(&link, &arguments.person, &key).await?;
+        recipe.approve(&link, &arguments.person, &key, arguments.replace).await?;
         let (name, version) = (&recipe.name, recipe.version);
         super::super::print(&format!(
             "{} has signed version {version} of {name}, sha256 {}\n",
@@ -185,9 +193,14 @@ pub(super) fn withdraw(arguments: &ToWithdraw) -> Result<Outcome, Failure> {
     let ToWithdraw { name, version, reason, .. } = arguments;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
-        let done = link.query("SELECT withdraw_recipe($1, $2, $3)", &[name, version, reason]).await?;
-        if done.first().is_some_and(|row| row.get(0)) {
-            super::super::print(&format!("version {version} of {name} is withdrawn\n"))?;
+        if let Some(serials) = PlantRecipe::withdraw(&link, (name, *version), reason).await? {
+            let mut text = format!("version {version} of {name} is withdrawn\n");
+            if !serials.is_empty() {
+                let parts = counted(serials.len(), "part");
+                text += &format!("{parts} left the queue; to queue them by another version: regrind plant queue\n");
+            }
+            serials.iter().for_each(|serial| text += &format!("  {serial}\n"));
+            super::super::print(&regrind::document::visible(&text))?;
             return Ok(Outcome::Accepted);
         }
         super::super::print(&format!(

@@ -8,10 +8,11 @@ use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
 use clap::{Args, Subcommand};
+use regrind::config::PlantConfig;
 use regrind::figures::statistics::quantile;
 use regrind::formats::{ResultFolder, ScratchFolder, write_atomic};
 use regrind::recipe::Recipe;
-use regrind_plant::{LeasedRun, PlantError, Study, run_overview};
+use regrind_plant::{DatabaseLink, LeasedRun, PlantError, RENEWAL, Study, run_overview};
 use serde_json::{Map, Value, json};
 
 use super::super::failure::Failure;
@@ -22,8 +23,10 @@ use super::recipes::{files_of, is_below};
 
 /// Time between two queries of a worker while there is no job.
 const ROUND: Duration = Duration::from_secs(5);
-/// Maximum duration of a run: the lease of a job without the time to store its result.
+/// Maximum duration of a run. A run that takes longer hangs.
 const MAX_RUN: Duration = Duration::from_secs(1700);
+/// Maximum wait for a plant that cannot be reached.
+const MAX_WAIT: Duration = Duration::from_secs(60);
 /// Maximum number of jobs of one study.
 const MAX_JOBS: usize = 1_000_000;
 /// Maximum number of reasons of failures that are shown.
@@ -90,7 +93,10 @@ struct ToBegin {
 Example:
   regrind study work --plant worker.toml --workers 2 --wait
 
-Exit codes: 0 no job is left; 2 bad arguments, or the database refuses the command; 3 the database cannot be reached.")]
+The command waits while the database cannot be reached, and keeps the result of a run meanwhile.
+
+Exit codes: 0 no job is left; 2 bad arguments, or the database refuses the command; 3 the database cannot be reached
+at the start.")]
 struct ToWork {
     /// Number of runs at a time
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=64))]
@@ -255,38 +261,88 @@ fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
     // The work of a person at this computer has priority.
     outside::give_way();
     super::super::runtime()?.block_on(async {
-        let mut workers = tokio::task::JoinSet::new();
+        // A wrong plant file, or a database that cannot be reached at the start, is told at once.
+        drop(open(&config).await?);
+        let (mut workers, mut made) = (tokio::task::JoinSet::new(), 0);
+        let here = tokio::task::LocalSet::new();
         for _ in 0..arguments.workers {
-            let (config, wait) = (config.clone(), arguments.wait);
-            workers.spawn(async move {
-                let mut made = 0_usize;
-                loop {
-                    let link = open(&config).await?;
-                    let Some(job) = LeasedRun::lease_next(&link).await? else {
-                        if !wait {
-                            return Ok::<_, Failure>(made);
-                        }
-                        tokio::time::sleep(ROUND).await;
-                        continue;
-                    };
-                    let study = Study::read(&link, &job).await?;
-                    // A run takes longer than a connection should stay idle.
-                    drop(link);
-                    let of = job.clone();
-                    let result = tokio::task::spawn_blocking(move || made_of(&study, &of)).await;
-                    let result = result.unwrap_or_else(|error| Err(error.to_string()));
-                    let link = open(&config).await?;
-                    made += usize::from(job.finish(&link, &result).await?);
-                }
-            });
+            workers.spawn_local_on(make_runs(config.clone(), arguments.wait), &here);
         }
-        let mut made = 0;
-        while let Some(worker) = workers.join_next().await {
-            made += worker.map_err(|error| Failure::Terminal(error.into()))??;
-        }
+        let all = async {
+            while let Some(worker) = workers.join_next().await {
+                made += worker.map_err(|error| Failure::Terminal(error.into()))??;
+            }
+            Ok::<_, Failure>(())
+        };
+        here.run_until(all).await?;
         super::super::print(&format!("{} made\n", super::super::words::counted(made, "run")))?;
         Ok(Outcome::Accepted)
     })
+}
+
+/// Makes the runs of studies, one after the other, until no job is left. With `waits`, waits for further jobs then. Waits
+/// also while the plant cannot be reached, and keeps the result of a run meanwhile. Returns the number of runs whose
+/// result the plant has accepted.
+async fn make_runs(config: PlantConfig, waits: bool) -> Result<usize, Failure> {
+    let mut made = 0;
+    loop {
+        let leased = once_reached(&config, async |link| {
+            let Some(job) = LeasedRun::lease_next(link).await? else { return Ok(None) };
+            Ok(Some((Study::read(link, &job).await?, job)))
+        });
+        let Some((study, job)) = leased.await? else {
+            if !waits {
+                return Ok(made);
+            }
+            tokio::time::sleep(ROUND).await;
+            continue;
+        };
+        let result = make_run(&config, study, &job).await;
+        made += usize::from(once_reached(&config, async |link| job.finish(link, &result).await).await?);
+    }
+}
+
+/// Makes the run of a leased job, and renews its lease meanwhile. Returns the summary of the run, or the reason why there
+/// is none.
+async fn make_run(config: &PlantConfig, study: Study, job: &LeasedRun) -> Result<Value, String> {
+    let of = job.clone();
+    let mut run = tokio::task::spawn_blocking(move || made_of(&study, &of));
+    loop {
+        tokio::select! {
+            ended = &mut run => return ended.unwrap_or_else(|error| Err(error.to_string())),
+            () = tokio::time::sleep(RENEWAL) => {}
+        }
+        // A run takes longer than a connection should stay idle. A lease that cannot be renewed now is renewed later,
+        // or it is over, and the plant refuses the result.
+        if let Ok(link) = open(config).await {
+            let _ = job.renew(&link).await;
+        }
+    }
+}
+
+/// Executes `step` with a new connection to the plant. Repeats it while the plant cannot be reached, with a wait that
+/// doubles up to [`MAX_WAIT`].
+///
+/// Returns an error that does not pass by itself.
+async fn once_reached<T>(
+    config: &PlantConfig,
+    step: impl AsyncFn(&DatabaseLink) -> Result<T, PlantError>,
+) -> Result<T, Failure> {
+    let mut wait = Duration::from_secs(1);
+    loop {
+        let done = match open(config).await {
+            Ok(link) => step(&link).await.map_err(Failure::from),
+            Err(error) => Err(error),
+        };
+        match done {
+            Err(Failure::Plant(error)) if error.may_pass() => {
+                eprintln!("study: {error}; this worker tries again in {} s", wait.as_secs());
+                tokio::time::sleep(wait).await;
+                wait = (2 * wait).min(MAX_WAIT);
+            }
+            other => return other,
+        }
+    }
 }
 
 /// Runs the recipe of `study` on a simulated cell in a separate process. `job` states the changed recipe values and the

@@ -231,6 +231,23 @@ impl LearningState {
     }
 }
 
+/// Returns, for each of `states`, true if it contradicts most of the others: more than half of its comparisons show that
+/// more than [`MAX_OWN_SHARE`] of the repeatable error is a machine's own. All states must be of the same recipe on
+/// different machines. Two machines that contradict each other are both named, because nothing tells which of them is
+/// right. A state without a comparison contradicts none.
+pub fn contradicting_machines(states: &[&LearningState]) -> Vec<bool> {
+    let own_share = |one: &LearningState, other: &LearningState| {
+        let mut alike = MachineSimilarity::default();
+        alike.compare([one, other], false).then(|| alike.comparisons[0].whole)
+    };
+    let contradicts = |(k, state): (usize, &&LearningState)| {
+        let others = states.iter().enumerate().filter(|(j, _)| *j != k);
+        let shares: Vec<f64> = others.filter_map(|(_, other)| own_share(state, other)).collect();
+        2 * shares.iter().filter(|share| **share > MAX_OWN_SHARE).count() > shares.len()
+    };
+    states.iter().enumerate().map(contradicts).collect()
+}
+
 fn has_same_bands(one: &LearningState, other: &LearningState) -> bool {
     let same = |(a, b): (&Band, &Band)| (a.min_wavelength_mm - b.min_wavelength_mm).abs() <= SAME * a.min_wavelength_mm;
     one.bands.len() == other.bands.len() && one.bands.iter().zip(&other.bands).all(same)
@@ -555,6 +572,28 @@ mod tests {
             fresh(rule).seeded_from(others, &similarity_of(0.1), GRID).unwrap().state.response
         };
         assert_eq!(begun(&[&own, &borrowed, &borrowed]), begun(&[&own]));
+    }
+
+    #[test]
+    fn contradicting_machine_is_found() {
+        let rule = GainRule::Wavelength;
+        let like = |seed: u64, factor: f64| {
+            let values = sum(&[(factor, &field(7)), (0.2, &field(seed))]);
+            machine(rule, values, [0.5, 1e-9])
+        };
+        let found = |states: &[LearningState]| contradicting_machines(&states.iter().collect::<Vec<_>>());
+        // Their own errors have a share of 0.04 / 1.04 of the power.
+        assert_eq!(found(&[like(1, 1.0), like(2, 1.0), like(3, 1.0)]), [false; 3]);
+        // Five times as large, of the other sign, of another form, and none at all.
+        let other = machine(rule, field(8), [0.5, 1e-9]);
+        let none = machine(rule, vec![0.0; GRID.len()], [0.5, 1e-9]);
+        for wrong in [like(3, 5.0), like(3, -1.0), other, none] {
+            assert_eq!(found(&[like(1, 1.0), wrong.clone(), like(2, 1.0)]), [false, true, false]);
+            assert_eq!(found(&[wrong, like(2, 1.0)]), [true; 2], "nothing tells which of two is right");
+        }
+        // Alone, or without anything to compare.
+        assert_eq!((found(&[like(1, 1.0)]), found(&[])), (vec![false], vec![]));
+        assert_eq!(found(&[fresh(rule), like(1, 1.0), like(2, 1.0)]), [false; 3]);
     }
 
     #[test]

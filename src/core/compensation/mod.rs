@@ -33,7 +33,7 @@ pub use cutoff_limits::{contact_width_mm, point_spacing_mm};
 pub use error::MapError;
 pub use filter::FilterOrder;
 pub use learning::{GainRule, LearningState, ParameterExplainer, PassObservation};
-pub use machine_transfer::{MachineSimilarity, TransferredState};
+pub use machine_transfer::{MachineSimilarity, TransferredState, contradicting_machines};
 pub use map::{ErrorMap, FilteredGrid, MapOptions, Smoothing, error_map, filter_grid, map_from_model};
 pub use next_pass::{CorrectionLimits, NextPass, NextPassError};
 pub use parameters::{

@@ -8,12 +8,17 @@ use serde_json::Value;
 use crate::Plant;
 use crate::program::{records_with, replaced, small_recipe};
 
+/// Enrols a cell with the key that signs its records.
+fn cell(plant: &Plant, name: &str) {
+    let file = format!("{name}.key");
+    let told: Value = serde_json::from_str(&plant.does(&["audit", "key", "--key", &file, "--json"])).unwrap();
+    plant.cell(name, &["--key", told["public_key"].as_str().unwrap()]);
+}
+
 /// Returns a plant of two cells, of which the first has made a part and published its learning.
 fn taught() -> (Plant, String) {
     let plant = Plant::new();
-    for name in ["cell-1", "cell-2"] {
-        plant.cell(name, &[]);
-    }
+    ["cell-1", "cell-2"].iter().for_each(|name| cell(&plant, name));
     let recipe = small_recipe(plant.home.path(), 1e5);
     let text = fs::read_to_string(&recipe).unwrap();
     fs::write(&recipe, replaced(&text, "cutoff_mm = 14.0", "cutoff_mm = 14.0\nlearn = true")).unwrap();
@@ -25,13 +30,20 @@ fn taught() -> (Plant, String) {
     (plant, name)
 }
 
-/// Lets a cell make a part of a world; returns its folder, and its output.
+/// Lets a cell make a part of a world, signed with its key; returns its folder, and its output.
 fn made(plant: &Plant, cell: &str, seed: &str) -> (PathBuf, String) {
+    made_with(plant, cell, seed, &plant.path(&format!("{cell}.key")).display().to_string())
+}
+
+/// Lets a cell make a part of a world. Its record is signed with `key`, or with none if this is empty.
+fn made_with(plant: &Plant, cell: &str, seed: &str, key: &str) -> (PathBuf, String) {
     let folders = || fs::read_dir(plant.path(cell)).into_iter().flatten().map(|entry| entry.unwrap().path());
     let before: Vec<PathBuf> = folders().collect();
     let file = format!("{cell}.toml");
     let arguments = ["run", "small.toml", "--cell", "sim", "--seed", seed, "--runs", cell, "--plant", &file];
-    let (code, out, errors) = crate::run(&arguments, plant.home.path());
+    let mut command = crate::program::regrind(&arguments, plant.home.path());
+    command.env("REGRIND_KEY", key);
+    let (code, out, errors) = crate::program::run_to_end(command, plant.home.path());
     assert!(matches!(code, 0 | 1), "{out}{errors}");
     let new = folders().find(|folder| !before.contains(folder) && folder.join("journal.sqlite").is_file());
     (new.expect("a run"), format!("{out}{errors}"))
@@ -124,8 +136,11 @@ fn forged_learned_error_is_ignored() {
     states(&plant, "0.1");
     // An attacker with all rights to the database: a content under a wrong hash, and under the right one.
     let broken = "jsonb_set(convert_from(content, 'UTF8')::jsonb, '{known,response,0}', '7')::text";
-    let tries =
-        [(broken, false, "differs from the record"), (broken, true, "impossible"), ("'{'", true, "learned.json")];
+    let tries = [
+        (broken, false, "differs from the record"),
+        (broken, true, "do not name its file"),
+        ("'{'", true, "do not name its file"),
+    ];
     for (k, (forged, is_hashed, words)) in tries.into_iter().enumerate() {
         plant.sql(&format!(
             "UPDATE artefact SET content = convert_to({forged}, 'UTF8') WHERE sha256 = (SELECT sha256 FROM lesson WHERE cell = 1)"
@@ -144,4 +159,52 @@ fn forged_learned_error_is_ignored() {
         assert!(last["what"] == "a lesson refused" && last["by"] == "cell-2", "{last}");
         fs::rename(plant.path("cell-2"), plant.path(&format!("aside-{k}"))).unwrap();
     }
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn only_signed_runs_teach() {
+    let (plant, _) = taught();
+    states(&plant, "0.1");
+    let lessons = || plant.sql("SELECT count(*) FROM lesson");
+    let ship = |cell: &str| {
+        let file = format!("{cell}.toml");
+        crate::run(&["ship", "--once", "--plant", &file, "--runs", cell], plant.home.path())
+    };
+    // A cell without a key, one with a key that nobody knows, and one whose key signs for another cell.
+    plant.cell("cell-3", &[]);
+    let unknown = plant.path("unknown.key").display().to_string();
+    plant.does(&["audit", "key", "--key", &unknown]);
+    let of_another = plant.path("cell-2.key").display().to_string();
+    for (seed, key) in [("3", ""), ("4", &unknown[..]), ("5", &of_another[..])] {
+        made_with(&plant, "cell-3", seed, key);
+        let (code, out, errors) = ship("cell-3");
+        assert!(code == 0 && errors.contains("it teaches no other cell"), "{key}: {code} {out}{errors}");
+        assert_eq!(lessons(), "1", "{key}");
+    }
+    assert_eq!(plant.sql("SELECT count(*) FROM incident"), "0", "a cell without a key is no incident");
+    // A seal with the name of a known key and the signature of nobody passes the database, and no cell.
+    plant.sql(
+        "INSERT INTO cell_key SELECT id, key FROM cell CROSS JOIN (SELECT key FROM cell_key LIMIT 1) k WHERE name = 'cell-3';
+         UPDATE record SET text = regexp_replace(text, '\"key\":\"[0-9a-f]{64}\"', '\"key\":\"' || (SELECT key FROM cell_key LIMIT 1) || '\"')
+            WHERE text LIKE '%\"kind\":\"seal\"%' AND run IN (SELECT r.id FROM run r JOIN cell c ON c.id = r.cell WHERE c.name = 'cell-3')",
+    );
+    let taught = "SELECT count(teach(r.id, l.kind, a.sha256)) FROM run r JOIN run_artefact a ON a.run = r.id AND a.name = 'learned.json'
+        CROSS JOIN (SELECT kind FROM kind_for_test) l JOIN record e ON e.run = r.id AND e.seq = r.records AND e.text LIKE '%\"kind\":\"seal\"%'";
+    plant.sql("CREATE VIEW kind_for_test AS SELECT kind FROM lesson WHERE cell = 1; GRANT SELECT ON kind_for_test TO regrind_cell");
+    assert_eq!(plant.asked_by("cell-3", taught).unwrap(), "0", "none is refused");
+    assert_eq!(lessons(), "3");
+    let (_, said) = made(&plant, "cell-2", "2");
+    assert!(
+        said.contains("of cell-3 is ignored: ") && said.contains("is not signed with one of the given keys"),
+        "{said}"
+    );
+    assert!(said.contains("begins with"), "the signed one teaches: {said}");
+    assert_eq!(plant.incidents().last().unwrap()["what"], "a lesson refused");
+    // A cell that was retired teaches nothing more.
+    plant.does(&["plant", "retire", "cell-1", "--plant", "owner.toml"]);
+    assert_eq!(
+        plant.asked_by("cell-2", "SELECT cell FROM lessons((SELECT kind FROM kind_for_test), true)").unwrap(),
+        "cell-3"
+    );
 }

@@ -4,6 +4,7 @@ mod backup;
 mod book;
 mod knowledge;
 mod layout;
+mod limits;
 mod page;
 mod records;
 mod rights;

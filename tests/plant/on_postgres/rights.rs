@@ -3,7 +3,7 @@
 use std::fs;
 
 use regrind::journal::{AuditKey, Entry, Header, Journal, Reader, Record, RecordKind};
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::Plant;
 
@@ -11,7 +11,7 @@ use crate::Plant;
 const SQL: &str = "x'); DROP TABLE regrind.record CASCADE; --\" \\ $$ {} % \u{1}";
 
 /// Writes a journal of a few records below a folder of runs.
-fn journal(plant: &Plant, runs: &str, name: &str, part: &str) -> Vec<Record> {
+pub fn journal(plant: &Plant, runs: &str, name: &str, part: &str) -> Vec<Record> {
     let folder = plant.path(runs).join(name);
     let header = Header {
         run: name.into(),
@@ -32,7 +32,7 @@ fn journal(plant: &Plant, runs: &str, name: &str, part: &str) -> Vec<Record> {
 }
 
 /// Returns the call that ships records, as written by hand.
-fn ship(run: &str, from: u64, records: &[Record]) -> String {
+pub fn ship(run: &str, from: u64, records: &[Record]) -> String {
     let hashes: Vec<String> = records.iter().map(|r| format!("decode('{}', 'hex')", r.hash)).collect();
     let texts: Vec<String> =
         records.iter().map(|r| format!("convert_from(decode('{}', 'hex'), 'UTF8')", hex(&r.text()))).collect();
@@ -105,6 +105,12 @@ fn cell_account_reads_only_its_own() {
         "SELECT flaw_of(NULL, 1, NULL, NULL)",
         "SELECT told_by(NULL, NULL)",
         "SELECT queue_work('SN', '', NULL, NULL)",
+        "SELECT sign_recipe('', 'Ada', '', '', true)",
+        "SELECT set_quota('runs_per_day', 1)",
+        "SELECT count_usage(1, 1, 1)",
+        "SELECT * FROM quota",
+        "SELECT * FROM cell_usage",
+        "SELECT leave_queue('')",
         "SELECT pg_read_file('/etc/passwd')",
         "COPY record FROM PROGRAM 'true'",
     ];
@@ -150,18 +156,17 @@ fn forged_records_become_incidents() {
         ("behind the end", "1", count as u64 + 1, vec![behind(stands)]),
         ("a number that is not its place's", &run, 3, vec![wrong_number]),
     ];
+    // The same flaw twice is one incident that happened twice.
+    let counted = || plant.sql("SELECT coalesce(sum(times), 0) FROM incident").parse::<u64>().unwrap();
     for (what, run, from, records) in &forged {
-        let before = plant.incidents().len();
+        let before = counted();
         let said = plant.asked_by("cell-1", &ship(run, *from, records)).unwrap();
         let (stands, refused) = said.split_once('|').unwrap();
         assert!(!refused.is_empty() && [2, count].contains(&stands.parse().unwrap()), "{what}: {said}");
+        assert_eq!(counted(), before + 1, "{what}");
         let incidents = plant.incidents();
-        assert_eq!(incidents.len(), before + 1, "{what}");
-        let last = &incidents[before];
-        assert!(
-            last["what"] == "a broken chain" && last["by"] == "cell-1" && last["words"] == *refused,
-            "{what}: {last}"
-        );
+        let is_told = |of: &Value| of["what"] == "a broken chain" && of["by"] == "cell-1" && of["words"] == *refused;
+        assert!(incidents.iter().any(is_told), "{what}: {incidents:?}");
     }
     // A valid chain of another run under the name of this one.
     let run_4 = plant.asked_by("cell-1", "SELECT id FROM open_run('another')").unwrap();

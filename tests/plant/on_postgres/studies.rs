@@ -45,6 +45,8 @@ fn study_runs_match_their_seeds() {
     // One worker dies with a job, whose lease expires faster here.
     let mut dies = Running::new(regrind(&["study", "work", "--plant", "farm-1.toml"], plant.home.path()));
     dies.until("a job", |_| (plant.sql("SELECT count(*) FROM study_job WHERE state = 'leased'") == "1").then_some(()));
+    let lease = "SELECT leased_until < now() + interval '61 seconds' FROM study_job WHERE state = 'leased'";
+    assert_eq!(plant.sql(lease), "t", "the job of a worker that died is soon free again");
     dies.signal("KILL");
     dies.end();
     plant.sql("UPDATE study_job SET leased_until = now() - interval '1 second' WHERE state = 'leased'");
@@ -127,4 +129,39 @@ fn failed_runs_are_failed_with_their_reason() {
     let told = plant.does(&["study", "show", "limits", "--plant", "planner.toml"]);
     let lines: Vec<&str> = told.lines().collect();
     assert!(lines.len() == 4 && lines[3].starts_with("failed: 1, such as seed 7: the run was held: "), "{told}");
+}
+
+/// A worker waits while the database restarts, keeps the result of its run, and renews the lease of its job.
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn worker_survives_restart_of_database() {
+    let mut plant = Plant::new();
+    plant.somebody("planner", "planner");
+    plant.somebody("farm-1", "worker");
+    let recipe = small_recipe(plant.home.path(), 1000.0).display().to_string();
+    plant.does(&["study", "begin", &recipe, "--name", "limits", "--seeds", "7..8", "--plant", "planner.toml"]);
+    // Its messages go to a file, so that they can be read while it runs.
+    let program = regrind(&[], plant.home.path()).get_program().to_str().unwrap().to_owned();
+    let mut command = std::process::Command::new("sh");
+    command.args(["-c", &format!("exec '{program}' study work --plant farm-1.toml 2> told")]);
+    let mut worker = Running::new({
+        command.current_dir(plant.home.path());
+        command
+    });
+    worker
+        .until("a job", |_| (plant.sql("SELECT count(*) FROM study_job WHERE state = 'leased'") == "1").then_some(()));
+    plant.postgres.kill();
+    let told = || std::fs::read_to_string(plant.path("told")).unwrap_or_default();
+    worker.until("the loss", |_| told().contains("tries again").then_some(()));
+    plant.postgres.go_on();
+    let (code, told) = worker.end();
+    assert_eq!(code, 0, "{told}");
+    assert!(jobs(&plant).iter().all(|job| job["state"] == "done"));
+
+    // Only the lease that holds is renewed.
+    plant
+        .sql("UPDATE study_job SET state = 'leased', worker = 'farm_1', lease = 5, leased_until = now() WHERE job = 1");
+    let renew = |lease: i32| plant.asked_by("farm-1", &format!("SELECT renew_job(1, 1, {lease}, 60)")).unwrap();
+    assert_eq!((renew(4), renew(5)), ("f".into(), "t".into()));
+    assert_eq!(plant.sql("SELECT leased_until > now() + interval '50 seconds' FROM study_job WHERE job = 1"), "t");
 }

@@ -143,7 +143,7 @@ fn unsigned_recipe_refused_as_incident() {
     assert_eq!(plant.incidents().last().unwrap()["what"], "recipe refused");
     let (_, told) =
         plant.ends(&["plant", "approve", "small", "--person", "Ada", "--key", "Bob.key", "--plant", "planner.toml"], 2);
-    for piece in ["version 1 of small", "already signed by Ada"] {
+    for piece in ["version 1 of small", "already signed by Bob with this key", "--replace"] {
         assert!(told.contains(piece), "{piece}: {told}");
     }
 
@@ -348,4 +348,72 @@ fn unprovable_part_and_hoarder_hold_nobody_up() {
     // A run that cannot begin, such as that of a second program, gives its part back at once.
     plant.ends(&["work", "--plant", "cell-1.toml", "--once", "--part", "SN-7", "--cell", "nowhere.toml"], 2);
     assert_eq!(state("SN-7"), "open");
+}
+
+/// A name that was typed wrongly is replaced, and costs no version.
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn wrong_name_of_signer_is_replaced() {
+    let plant = Plant::new();
+    let approvers = approved(&plant);
+    cell(&plant, "cell-1", &approvers);
+    fs::write(plant.path("panel.toml"), fs::read_to_string(plant.path("small.toml")).unwrap() + "\n# another one\n")
+        .unwrap();
+    plant.does(&["plant", "propose", "panel.toml", "--plant", "planner.toml"]);
+    let sign = |person: &str, key: &str, more: &[&str]| {
+        let file = format!("{key}.key");
+        let arguments = ["plant", "approve", "panel", "--person", person, "--key", &file, "--plant", "planner.toml"];
+        crate::run(&[&arguments[..], more].concat(), plant.home.path()).0
+    };
+    // Bob signs as Ada, which keeps Ada out until one of them says that the other name was wrong.
+    assert_eq!(sign("Ada", "Bob", &[]), 0);
+    assert_eq!(sign("Ada", "Bob", &["--replace"]), 2, "the same again");
+    assert_eq!(sign("Ada", "Ada", &[]), 2);
+    let queue = || plant_queue(&plant, "SN-1", "panel");
+    assert_eq!(queue(), 2, "one signature");
+    assert_eq!(sign("Ada", "Ada", &["--replace"]), 0);
+    assert_eq!(queue(), 2, "two keys, and one name");
+    assert_eq!(sign("Bob", "Bob", &[]), 2);
+    assert_eq!(sign("Bob", "Bob", &["--replace"]), 0);
+    assert_eq!(plant.sql("SELECT earlier_names FROM approval WHERE person = 'Bob' AND earlier_names <> '{}'"), "{Ada}");
+    assert_eq!(queue(), 0);
+    plant.does(&["work", "--plant", "cell-1.toml", "--part", "SN-1", "--once"]);
+}
+
+fn plant_queue(plant: &Plant, serial: &str, recipe: &str) -> i32 {
+    crate::run(&["plant", "queue", serial, "--recipe", recipe, "--plant", "planner.toml"], plant.home.path()).0
+}
+
+/// The parts of a recipe that is withdrawn leave the queue, and its text can come back as another version.
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn withdrawn_recipe_can_come_back() {
+    let plant = Plant::new();
+    let approvers = approved(&plant);
+    cell(&plant, "cell-1", &approvers);
+    ["SN-1", "SN-2", "SN-3"].iter().for_each(|serial| queue(&plant, serial, &[]));
+    assert_eq!(plant.asked_by("cell-1", "SELECT serial FROM take_work(60)").unwrap(), "SN-1");
+    assert_eq!(plant.asked_by("cell-1", "SELECT begin_work(1, 1, 'run-1')").unwrap(), "");
+    assert_eq!(plant.asked_by("cell-1", "SELECT serial FROM take_work(60)").unwrap(), "SN-2");
+    let withdraw =
+        ["plant", "withdraw", "small", "--version", "1", "--reason", "wrong wheel", "--plant", "planner.toml"];
+    let said = plant.does(&withdraw);
+    assert!(said.contains("2 parts left the queue") && said.ends_with("  SN-2\n  SN-3\n"), "{said}");
+    plant.ends(&withdraw, 1);
+    // The leased one is refused at its beginning; the begun one belongs to its run.
+    assert!(plant.asked_by("cell-1", "SELECT begin_work(2, 1, 'run-2')").unwrap().contains("it was withdrawn"));
+    let states = "SELECT string_agg(serial || ' ' || state, ', ' ORDER BY id) FROM work";
+    assert_eq!(plant.sql(states), "SN-1 begun, SN-2 withdrawn, SN-3 withdrawn");
+    assert_eq!(plant.sql("SELECT count(*) FROM work_step WHERE step = 'withdrawn'"), "2");
+
+    plant.does(&["plant", "propose", "small.toml", "--plant", "planner.toml"]);
+    assert_eq!(plant_queue(&plant, "SN-2", "small"), 2, "the earlier signatures do not count");
+    for person in ["Ada", "Bob"] {
+        let key = format!("{person}.key");
+        plant.does(&["plant", "approve", "small", "--person", person, "--key", &key, "--plant", "planner.toml"]);
+    }
+    queue(&plant, "SN-2", &[]);
+    assert_eq!(work(&plant).iter().filter(|part| part["version"] == 2).count(), 1);
+    // The same text is proposed once while it is in force.
+    plant.ends(&["plant", "propose", "small.toml", "--plant", "planner.toml"], 2);
 }

@@ -7,7 +7,7 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
 
 use regrind_journal::{
-    Anchor, AuditKey, Entry, ExternalEvidence, Journal, JournalError, PublicKey, Reader, Record, RecordKind,
+    Anchor, AuditKey, Entry, Excerpt, ExternalEvidence, Journal, JournalError, PublicKey, Reader, Record, RecordKind,
     SEALED_EVERY, Verified, canonical_json, sha256_hex, verify, verify_against,
 };
 use rusqlite::Connection;
@@ -418,4 +418,53 @@ fn public_key_text_forms() {
     }
     let fingerprint = key.fingerprint();
     assert_eq!((fingerprint.len(), fingerprint.split(' ').count()), (19, 4));
+}
+
+#[test]
+fn excerpt_proves_last_records() {
+    let (home, key) = (home(), AuditKey::new());
+    let folder = home.path().join("run");
+    let mut journal = Journal::create_with(&folder, header(), Some(key.clone())).unwrap();
+    write_notes(&mut journal, 0..5);
+    let file = journal.store("learned.json", b"{}", 5, 1).unwrap();
+    write_notes(&mut journal, 6..8);
+    journal.close(8, 1, json!("accepted")).unwrap();
+    let records = records(&folder);
+    let first = records.iter().position(|record| record.kind == RecordKind::Artefact).unwrap();
+    let texts: Vec<String> = records[first..].iter().map(Record::text).collect();
+    let before = &records[first].prev_hash;
+    let of = |run: &str, before: &str, texts: &[String], keys: &[PublicKey]| {
+        Excerpt { run, before, texts }.verify(keys).map_err(|error| match error {
+            JournalError::Broken { .. } => "broken",
+            JournalError::NoAuthor { .. } => "no author",
+            other => panic!("{other}"),
+        })
+    };
+    let known = [AuditKey::new().public(), key.public()];
+    let files = of("run-1", before, &texts, &known).unwrap();
+    assert_eq!((files.len(), &files[0].name[..], &files[0].sha256), (1, "learned.json", &sha256_hex(b"{}")));
+    assert_eq!(file.sha256, files[0].sha256);
+    // Nobody known has signed it, or it was signed for another run.
+    assert_eq!(of("run-1", before, &texts, &known[..1]), Err("no author"));
+    assert_eq!(of("run-1", before, &texts, &[]), Err("no author"));
+    assert_eq!(of("run-2", before, &texts, &known), Err("no author"));
+    // Every text changed, left out, doubled or exchanged, and another hash before.
+    for k in 0..texts.len() {
+        let changed = |change: &dyn Fn(&mut Vec<String>)| {
+            let mut texts = texts.clone();
+            change(&mut texts);
+            of("run-1", before, &texts, &known).is_err()
+        };
+        // The seal signs what stands before it.
+        let is_seal = k + 1 == texts.len();
+        assert!(is_seal || changed(&|texts| texts[k] = texts[k].replace("SN 7", "SN 8")), "{k}");
+        assert!(k == 0 || changed(&|texts| drop(texts.remove(k))), "{k}");
+        assert!(changed(&|texts| texts.insert(k, texts[k].clone())), "{k}");
+        assert!(k == 0 || changed(&|texts| texts.swap(k - 1, k)), "{k}");
+    }
+    assert_eq!(of("run-1", &"0".repeat(64), &texts, &known), Err("broken"));
+    // A shorter excerpt proves what it has; one without its end or its seal proves nothing.
+    assert_eq!(of("run-1", &records[first].hash, &texts[1..], &known).unwrap(), []);
+    assert_eq!(of("run-1", before, &texts[..texts.len() - 1], &known), Err("broken"));
+    assert_eq!(of("run-1", before, &[], &known), Err("broken"));
 }
