@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use regrind_live::{OpcUaSettings, SparkplugSettings};
-use regrind_plant::{Approver, ArtefactSettings, DatabaseSettings};
+use regrind_plant::{Approver, ArchiveSettings, ArtefactSettings, DatabaseSettings};
 use schemars::JsonSchema;
 use serde::Deserialize;
 
@@ -27,6 +27,8 @@ struct PlantFile {
     approver: Vec<Approver>,
     /// Store for large files of runs. Default: the database.
     artefacts: Option<ArtefactSettings>,
+    /// Archive of the runs of earlier months, for the owner of the database. Default: none.
+    archive: Option<ArchiveSettings>,
     /// Broker to which the cell publishes its status. Default: none.
     sparkplug: Option<SparkplugSettings>,
     /// Server that shows the status of the cell. Default: none.
@@ -60,6 +62,8 @@ pub struct PlantConfig {
     pub approvers: Vec<Approver>,
     /// Store for large files of runs.
     pub artefacts: Option<ArtefactSettings>,
+    /// Archive of the runs of earlier months.
+    pub archive: Option<ArchiveSettings>,
     /// Sparkplug B broker to which the status of the cell is published.
     pub sparkplug: Option<SparkplugSettings>,
     /// OPC UA server that shows the status of the cell.
@@ -93,7 +97,7 @@ impl PlantConfig {
         document.check_schema(&SCHEMA);
         let written: Option<PlantFile> = document.deserialize();
         let at = path.parent().unwrap_or(Path::new(""));
-        let found = written.map(|PlantFile { plant, database, approver, artefacts, sparkplug, opcua }| Self {
+        let found = written.map(|PlantFile { plant, database, approver, artefacts, archive, sparkplug, opcua }| Self {
             cell: plant.cell,
             machines_differ: plant.machines_differ,
             database: database.map(|database| DatabaseSettings {
@@ -103,6 +107,7 @@ impl PlantConfig {
             }),
             approvers: approver,
             artefacts: artefacts.map(|kept| ArtefactSettings { folder: at.join(kept.folder), ..kept }),
+            archive: archive.map(|kept| ArchiveSettings { folder: at.join(kept.folder), ..kept }),
             sparkplug: sparkplug.map(|broker| SparkplugSettings {
                 password_file: resolve_path(at, broker.password_file),
                 certificates: resolve_path(at, broker.certificates),

@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::error::FormatError;
-use super::registration::try_writing;
+use super::registration::{sync_folder, try_writing};
 use super::system::is_socket;
 
 /// Writable folder; the folders that were created for it are removed again unless it is kept.
@@ -91,6 +91,26 @@ impl ScratchFolder {
     pub fn path(&self) -> &Path {
         &self.0
     }
+}
+
+/// Moves the folder `from` to `to` on the same disk, and flushes both names to the disk. Missing parents of `to` are
+/// created. The content of `from` must be on the disk already.
+///
+/// # Errors
+/// `to` exists. A folder that cannot be created, renamed or flushed.
+pub fn move_folder(from: &Path, to: &Path) -> Result<(), FormatError> {
+    let failed = |action| move |source| FormatError::Unwritable { path: to.to_owned(), action, source };
+    if fs::symlink_metadata(to).is_ok() {
+        return Err(failed("creating it")(io::Error::from(io::ErrorKind::AlreadyExists)));
+    }
+    let parent = to.parent().unwrap_or(Path::new(""));
+    fs::create_dir_all(parent).map_err(failed("creating its folder"))?;
+    fs::rename(from, to).map_err(failed("renaming it"))?;
+    // Each parent can be new.
+    for folder in to.ancestors().take(4).filter(|folder| !folder.as_os_str().is_empty()) {
+        sync_folder(folder).map_err(failed("flushing it to the disk"))?;
+    }
+    sync_folder(from).map_err(failed("flushing it to the disk"))
 }
 
 impl Drop for ScratchFolder {

@@ -61,7 +61,7 @@ pub use document::{
 };
 pub use error::FormatError;
 pub use figures::write_figures;
-pub use folder::{ResultFolder, ScratchFolder, finished_files, remove_socket};
+pub use folder::{ResultFolder, ScratchFolder, finished_files, move_folder, remove_socket};
 pub use form_document::save_form;
 pub use height_map::HeightMap;
 pub use jsonl_appender::JsonlAppender;

@@ -30,6 +30,8 @@ pub struct PlantRun {
     pub head: String,
     /// Keys that may have signed the cell's records, as the plant has them.
     pub keys: Vec<PublicKey>,
+    /// Folder to which the run was archived. The plant then has neither its records nor its files.
+    pub archive: Option<String>,
 }
 
 impl PlantRun {
@@ -41,7 +43,7 @@ impl PlantRun {
     pub async fn find(link: &DatabaseLink, cell: Option<&str>, name: &str) -> Result<Self, PlantError> {
         let failed = refused("to find a run");
         let text = "SELECT r.id, c.name, r.name, r.records, r.head,
-                array(SELECT k.key FROM cell_key k WHERE k.cell = c.id ORDER BY k.since, k.key)
+                array(SELECT k.key FROM cell_key k WHERE k.cell = c.id ORDER BY k.since, k.key), r.archive
             FROM run r JOIN cell c ON c.id = r.cell WHERE r.name = $1 AND ($2::text IS NULL OR c.name = $2) ORDER BY r.id DESC LIMIT 1";
         let row = link.client().query_opt(text, &[&name, &cell]).await.map_err(failed)?;
         let no_run = || PlantError::NoRun { cell: cell.unwrap_or("any cell").to_owned(), name: name.to_owned() };
@@ -53,6 +55,7 @@ impl PlantRun {
             records: u64::try_from(row.get::<_, i32>(3)).unwrap_or(0),
             head: HEXLOWER.encode(row.get(4)),
             keys: row.get::<_, Vec<String>>(5).iter().filter_map(|key| key.parse().ok()).collect(),
+            archive: row.get(6),
         })
     }
 
@@ -86,7 +89,7 @@ impl PlantRun {
     /// [`regrind_journal::verify`] for this.
     ///
     /// # Errors
-    /// The folder is in use, a record is missing, the text of a record does not have the form that a journal writes, or
+    /// The run was archived, the folder is in use, a record is missing, the text of a record does not have the form that a journal writes, or
     /// the plant cannot be reached.
     pub async fn fetch(
         &self,
@@ -94,6 +97,9 @@ impl PlantRun {
         artefacts: Option<&ArtefactSettings>,
         folder: &Path,
     ) -> Result<(), PlantError> {
+        if let Some(place) = self.archive.clone() {
+            return Err(PlantError::Archived { cell: self.cell.clone(), run: self.name.clone(), place });
+        }
         let records = self.records(link, folder).await?;
         let anchor = last_sealed(&records);
         restore(folder, records, anchor.as_ref())?;

@@ -37,6 +37,14 @@ pub enum PlantError {
     Differs { run: String, what: String },
     #[error("the database of the plant has no run {name:?} of the cell {cell:?}; to list the runs: regrind plant runs")]
     NoRun { cell: String, name: String },
+    #[error(
+        "{run} of {cell} was archived to {place}; verify it there (regrind audit verify {place}), or bring it back: regrind plant unarchive"
+    )]
+    Archived { cell: String, run: String, place: String },
+    #[error(
+        "{}: the plant has no archived run with this name and this record; to list the runs: regrind plant runs", .folder.display()
+    )]
+    NotArchived { folder: PathBuf },
     #[error("{0}")]
     Recipe(String),
     #[error("{name}: {what}")]

@@ -4,6 +4,7 @@
 //! to the plant, and fetches work from it.
 #![cfg(feature = "plant")]
 
+mod archive;
 mod copy;
 mod error;
 mod knowledge;
@@ -17,6 +18,7 @@ mod settings;
 mod studies;
 mod work;
 
+pub use archive::{ArchiveResult, archive_runs, restore_run};
 pub use copy::{PlantRun, content};
 pub use error::PlantError;
 pub use knowledge::Knowledge;
@@ -26,7 +28,7 @@ pub use recipes::{Approval, PlantRecipe};
 pub use replication::{ReplicationResult, Replicator, run_overview};
 pub use reported::Reported;
 pub use schema::{NewMember, PlantRole, add_cell_keys, check_layout, enrol, enrol_cell, migrate, retire_cell};
-pub use settings::{Approver, ArtefactSettings, DatabaseSettings};
+pub use settings::{Approver, ArchiveSettings, ArtefactSettings, DatabaseSettings};
 pub use studies::{LeasedRun, RENEWAL, Study};
 pub use tokio_postgres::Row;
 pub use tokio_postgres::types::ToSql;

@@ -301,6 +301,7 @@ async fn compare_with_plant(
         records: u64::try_from(there.records).unwrap_or(0),
         head: HEXLOWER.encode(&there.head),
         keys: Vec::new(),
+        archive: None,
     };
     match copy.check_local_journal(folder) {
         Err(PlantError::Differs { run, what }) => {

@@ -53,6 +53,22 @@ fn from_mb() -> f64 {
     8.0
 }
 
+/// Archive of the runs of earlier months.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ArchiveSettings {
+    /// Folder of the archive; relative to this file.
+    pub folder: PathBuf,
+    /// Number of whole months that stay in the database before the present one.
+    #[serde(default = "keep_months")]
+    #[schemars(range(min = 1, max = 1200))]
+    pub keep_months: u16,
+}
+
+fn keep_months() -> u16 {
+    24
+}
+
 /// Person whose signature approves a recipe.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]

@@ -4,7 +4,7 @@ use clap::{Args, Subcommand};
 
 use super::super::Outcome;
 use super::super::failure::Failure;
-use super::{members, queue, quota, recipes, runs, serve};
+use super::{archive, members, queue, quota, recipes, runs, serve};
 
 /// Manage the database of a plant of many cells
 #[derive(Args, Debug)]
@@ -42,6 +42,8 @@ enum PlantCommand {
     Queue(queue::ToQueue),
     Unqueue(queue::ToUnqueue),
     Work(queue::ToList),
+    Archive(archive::ToArchive),
+    Unarchive(archive::ToRestore),
     Serve(serve::Arguments),
 }
 
@@ -63,6 +65,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         PlantCommand::Queue(of) => queue::queue(of),
         PlantCommand::Unqueue(of) => queue::unqueue(of),
         PlantCommand::Work(of) => queue::list(of),
+        PlantCommand::Archive(of) => archive::archive(of),
+        PlantCommand::Unarchive(of) => archive::unarchive(of),
         PlantCommand::Serve(of) => serve::serve(of),
     }
 }

@@ -1,6 +1,7 @@
 //! Commands and arguments of a plant of many cells: its database, and the live values of a cell. The program has them
 //! only with the feature `plant`; `without_plant.rs` is the twin of this module without it.
 
+mod archive;
 mod audit;
 mod cell_monitor;
 mod confirmed_part;

@@ -1,5 +1,6 @@
 //! Tests that are ignored unless PostgreSQL is requested.
 
+mod archive;
 mod backup;
 mod book;
 mod knowledge;

@@ -1,0 +1,223 @@
+//! Archive of a plant: the runs of earlier months as run folders, which `audit verify` proves without the plant.
+//!
+//! ```text
+//!  record, run_artefact, artefact --fetch, prove--> FOLDER/2024-11/CELL/RUN     the run keeps its row and its figures
+//!                                 <--prove, restore--
+//! ```
+//!
+//! A run leaves the database after its folder is on the disk and proven. A run that has not ended, or whose copy cannot
+//! be proven, stays.
+
+use std::fs;
+use std::path::{Component, Path, PathBuf};
+
+use data_encoding::HEXLOWER;
+use regrind_formats::{ScratchFolder, move_folder};
+use regrind_journal::{Artefact, Reader, Record, RecordKind};
+use tokio_postgres::Transaction;
+use tokio_postgres::types::ToSql;
+
+use super::copy::PlantRun;
+use super::error::{PlantError, refused};
+use super::link::DatabaseLink;
+use super::settings::ArtefactSettings;
+
+/// Number of records that are restored at once.
+const BATCH: usize = 1000;
+
+/// Result of an archiving.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ArchiveResult {
+    /// Number of runs that were written to the archive.
+    pub runs: u64,
+    /// Number of records that were removed from the database.
+    pub records: u64,
+    /// Number of contents of files that were removed from the database.
+    pub contents: u64,
+    /// Runs that stay in the database, with the reason.
+    pub kept: Vec<(String, String)>,
+}
+
+/// Run of an earlier month.
+struct OldRun {
+    id: i32,
+    cell: String,
+    name: String,
+    /// First day of its month, `YYYY-MM`.
+    month: String,
+    is_ended: bool,
+}
+
+/// Writes the runs of all months before `before` to `folder`, each to `folder/YYYY-MM/CELL/RUN`, and removes their
+/// records and files from the database. `before` is the first month that stays, as `YYYY-MM`. The month of a run is that
+/// of its first arrival at the plant. `artefacts` names the folder with the large files, which stay there. The database
+/// role must be the owner.
+///
+/// # Errors
+/// The plant cannot be reached, or refuses a step. A folder cannot be written. A single run that cannot be archived is not
+/// an error: the result names it with the reason.
+pub async fn archive_runs(
+    link: &mut DatabaseLink,
+    artefacts: Option<&ArtefactSettings>,
+    (folder, before): (&Path, &str),
+) -> Result<ArchiveResult, PlantError> {
+    let mut result = ArchiveResult::default();
+    for block in blocks(link, before).await? {
+        for run in old_runs(link, block).await? {
+            match archive_run(link, artefacts, folder, &run).await {
+                Ok(None) => result.runs += 1,
+                Ok(Some(reason)) => result.kept.push((format!("{} of {}", run.name, run.cell), reason)),
+                // What is wrong with one copy must not keep the others here.
+                Err(error @ (PlantError::Journal(_) | PlantError::Differs { .. })) => {
+                    result.kept.push((format!("{} of {}", run.name, run.cell), error.to_string()));
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        let failed = refused("the removal of archived runs");
+        let row = link.client().query_one("SELECT records, contents FROM remove_archived($1)", &[&block]).await;
+        let row = row.map_err(failed)?;
+        let [records, contents] = [0, 1].map(|k| u64::try_from(row.get::<_, i64>(k)).unwrap_or(0));
+        result.records += records;
+        result.contents += contents;
+    }
+    Ok(result)
+}
+
+async fn blocks(link: &DatabaseLink, before: &str) -> Result<Vec<i32>, PlantError> {
+    let text = "SELECT first FROM month_block WHERE month < ($1::text || '-01')::date ORDER BY month, first";
+    let rows = link.client().query(text, &[&before]).await.map_err(refused("the months of the archive"))?;
+    Ok(rows.iter().map(|row| row.get(0)).collect())
+}
+
+async fn old_runs(link: &DatabaseLink, block: i32) -> Result<Vec<OldRun>, PlantError> {
+    let text = "SELECT id, cell, run, to_char(month, 'YYYY-MM'), is_ended FROM archivable WHERE block = $1 ORDER BY id";
+    let rows = link.client().query(text, &[&block]).await.map_err(refused("the runs of a month"))?;
+    let run = |row: &super::Row| OldRun {
+        id: row.get(0),
+        cell: row.get(1),
+        name: row.get(2),
+        month: row.get(3),
+        is_ended: row.get(4),
+    };
+    Ok(rows.iter().map(run).collect())
+}
+
+/// Writes one run to the archive in `folder`, proves what was written, and marks the run as archived. Returns the reason
+/// if the run stays in the database.
+async fn archive_run(
+    link: &DatabaseLink,
+    artefacts: Option<&ArtefactSettings>,
+    folder: &Path,
+    run: &OldRun,
+) -> Result<Option<String>, PlantError> {
+    if !run.is_ended {
+        return Ok(Some("it has not ended".into()));
+    }
+    let [cell, name] = [&run.cell, &run.name].map(|name| is_file_name(name).then_some(name));
+    let Some((cell, name)) = cell.zip(name) else {
+        return Ok(Some("the name of the cell or of the run cannot be the name of a folder".into()));
+    };
+    let place = folder.join(&run.month).join(cell).join(name);
+    let found = PlantRun::find(link, Some(&run.cell), &run.name).await?;
+    if !place.exists() {
+        let scratch = ScratchFolder::at(folder.join(".archiving"))?;
+        // The name of the folder is that of the run, as the record says.
+        let copy = scratch.path().join(name);
+        found.fetch(link, artefacts, &copy).await?;
+        found.prove(&copy, &[])?;
+        move_folder(&copy, &place)?;
+    }
+    // An earlier call can have ended between the move and the mark.
+    found.prove(&place, &[])?;
+    let place = fs::canonicalize(&place).unwrap_or(place).display().to_string();
+    let head = HEXLOWER.decode(found.head.as_bytes()).unwrap_or_default();
+    let mark = "UPDATE run SET archived_at = now(), archive = $2 WHERE id = $1 AND head = $3 AND archived_at IS NULL";
+    let values: [&(dyn ToSql + Sync); 3] = [&run.id, &place, &head];
+    match link.client().execute(mark, &values).await.map_err(refused("the mark of an archived run"))? {
+        0 => Ok(Some("records arrived while it was archived; archive it again".into())),
+        _ => Ok(None),
+    }
+}
+
+/// Returns true if `name` can be the name of a folder below another one: it leads nowhere else, and it is not hidden.
+fn is_file_name(name: &str) -> bool {
+    let mut parts = Path::new(name).components();
+    matches!((parts.next(), parts.next()), (Some(Component::Normal(part)), None) if part == name)
+        && !name.starts_with('.')
+}
+
+/// Brings a run back from its folder in the archive. The folder must prove the run with the keys of its cell, and must
+/// have the records that the plant had. Returns the name of the run with that of its cell. The database role must be the
+/// owner.
+///
+/// # Errors
+/// The folder proves nothing, the plant has no archived run with this record, or the plant cannot be reached.
+pub async fn restore_run(link: &mut DatabaseLink, folder: &Path) -> Result<String, PlantError> {
+    let records: Vec<Record> = Reader::open(folder)?.records(1).collect::<Result<_, _>>()?;
+    let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let head = records.last().map(|last| last.hash.clone()).unwrap_or_default();
+    let text = "SELECT c.name, r.id, r.cell FROM run r JOIN cell c ON c.id = r.cell
+        WHERE r.name = $1 AND r.head = decode($2, 'hex') AND r.archived_at IS NOT NULL";
+    let row = link.client().query_opt(text, &[&name, &head]).await.map_err(refused("to find a run"))?;
+    let no_run = || PlantError::NotArchived { folder: folder.to_owned() };
+    let row = row.ok_or_else(no_run)?;
+    let (cell, id, cell_id): (String, i32, i32) = (row.get(0), row.get(1), row.get(2));
+    PlantRun::find(link, Some(&cell), &name).await?.prove(folder, &[])?;
+    let step = link.client_mut().transaction().await.map_err(refused("a run from the archive"))?;
+    step.execute("SELECT restore_partitions($1)", &[&id]).await.map_err(refused("a month of the archive"))?;
+    for batch in records.chunks(BATCH) {
+        put_records(&step, id, batch).await?;
+    }
+    for record in records.iter().filter(|record| record.kind == RecordKind::Artefact) {
+        if let Ok(file) = serde_json::from_str::<Artefact>(&record.payload) {
+            put_file(&step, (id, cell_id), folder, &file).await?;
+        }
+    }
+    let mark = "UPDATE run SET archived_at = NULL, archive = NULL WHERE id = $1";
+    step.execute(mark, &[&id]).await.map_err(refused("the mark of a run"))?;
+    step.commit().await.map_err(refused("a run from the archive"))?;
+    Ok(format!("{name} of {cell}"))
+}
+
+async fn put_records(step: &Transaction<'_>, run: i32, records: &[Record]) -> Result<(), PlantError> {
+    let seqs: Vec<i32> = records.iter().map(|record| i32::try_from(record.seq).unwrap_or(i32::MAX)).collect();
+    let hashes: Vec<Vec<u8>> =
+        records.iter().map(|record| HEXLOWER.decode(record.hash.as_bytes()).unwrap_or_default()).collect();
+    let texts: Vec<String> = records.iter().map(Record::text).collect();
+    let put = "INSERT INTO record (run, seq, hash, text) SELECT $1, seq, hash, text
+        FROM unnest($2::int[], $3::bytea[], $4::text[]) AS u (seq, hash, text)";
+    let values: [&(dyn ToSql + Sync); 4] = [&run, &seqs, &hashes, &texts];
+    step.execute(put, &values).await.map(drop).map_err(refused("records from the archive"))
+}
+
+/// Puts the entry of a file of a run back, and its content where the database has none. The run folder is proven.
+async fn put_file(
+    step: &Transaction<'_>,
+    (run, cell): (i32, i32),
+    folder: &Path,
+    file: &Artefact,
+) -> Result<(), PlantError> {
+    let path: PathBuf = folder.join(&file.name);
+    let failed = refused("a file from the archive");
+    let content = fs::read(&path).map_err(|source| PlantError::Folder { path, source })?;
+    let (sha256, bytes) = (HEXLOWER.decode(file.sha256.as_bytes()).unwrap_or_default(), file.bytes as i64);
+    let values: [&(dyn ToSql + Sync); 4] = [&run, &file.name, &sha256, &bytes];
+    let put = "INSERT INTO run_artefact (run, name, sha256, bytes) VALUES ($1, $2, $3, $4) ON CONFLICT DO NOTHING";
+    step.execute(put, &values).await.map_err(&failed)?;
+    let put = "INSERT INTO artefact (sha256, bytes, content) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING";
+    step.execute(put, &[&sha256, &bytes, &content]).await.map_err(&failed)?;
+    let put = "INSERT INTO artefact_of (cell, sha256) VALUES ($1, $2) ON CONFLICT DO NOTHING";
+    step.execute(put, &[&cell, &sha256]).await.map(drop).map_err(&failed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::is_file_name;
+
+    #[test]
+    fn names_that_lead_elsewhere_are_no_folders() {
+        assert!(["run-1", "free form 7", "a.b", "\u{e4}"].iter().all(|name| is_file_name(name)));
+        assert!(["", ".", "..", "a/b", "/a", "a/", "./a", "../a", ".hidden"].iter().all(|name| !is_file_name(name)));
+    }
+}

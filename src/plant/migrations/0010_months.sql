@@ -1,0 +1,242 @@
+-- Records by month: one table for five years would be too large to drop, to move or to vacuum. A month has a block of numbers of runs, and
+-- the tables by run have a partition for each block. So a question for a run reads one partition, without its month.
+
+-- Numbers of runs. A month has one block, or further ones where it is full.
+CREATE TABLE month_block (
+    first integer PRIMARY KEY,
+    behind integer NOT NULL UNIQUE,
+    month date NOT NULL CHECK (extract(day FROM month) = 1),
+    next integer NOT NULL,
+    CHECK (first < behind AND next BETWEEN first AND behind)
+);
+CREATE INDEX month_block_month ON month_block (month, first);
+
+ALTER TABLE run ADD COLUMN archived_at timestamptz, ADD COLUMN archive text;
+CREATE INDEX run_archived ON run (id) WHERE archived_at IS NOT NULL;
+
+-- The tables of today become the first partitions.
+ALTER TABLE record RENAME TO record_before;
+ALTER INDEX record_pkey RENAME TO record_before_pkey;
+ALTER TABLE run_artefact RENAME TO run_artefact_before;
+ALTER INDEX run_artefact_pkey RENAME TO run_artefact_before_pkey;
+ALTER INDEX run_artefact_sha256 RENAME TO run_artefact_before_sha256;
+DROP POLICY own ON record_before;
+DROP POLICY everything ON record_before;
+DROP POLICY own ON run_artefact_before;
+DROP POLICY everything ON run_artefact_before;
+REVOKE ALL ON record_before, run_artefact_before FROM regrind_cell, regrind_reader;
+
+CREATE TABLE record (
+    run integer NOT NULL,
+    seq integer NOT NULL,
+    hash bytea NOT NULL,
+    -- The text that was hashed, byte for byte: docs/journal.md.
+    text text NOT NULL,
+    PRIMARY KEY (run, seq)
+) PARTITION BY RANGE (run);
+CREATE TABLE run_artefact (
+    run integer NOT NULL,
+    name text NOT NULL,
+    sha256 bytea NOT NULL,
+    bytes bigint NOT NULL,
+    PRIMARY KEY (run, name, sha256)
+) PARTITION BY RANGE (run);
+CREATE INDEX run_artefact_sha256 ON run_artefact (sha256);
+
+-- The partitions of a block. Rights are those of the whole tables: nobody reads a partition by itself.
+CREATE FUNCTION make_partitions(of_first integer, of_behind integer) RETURNS void
+LANGUAGE plpgsql SET search_path = regrind, pg_temp AS $$
+BEGIN
+    EXECUTE format('CREATE TABLE IF NOT EXISTS record_%s PARTITION OF record FOR VALUES FROM (%s) TO (%s)', of_first, of_first, of_behind);
+    EXECUTE format('CREATE TABLE IF NOT EXISTS run_artefact_%s PARTITION OF run_artefact FOR VALUES FROM (%s) TO (%s)', of_first, of_first, of_behind);
+    EXECUTE format('ALTER TABLE record_%s ENABLE ROW LEVEL SECURITY', of_first);
+    EXECUTE format('ALTER TABLE run_artefact_%s ENABLE ROW LEVEL SECURITY', of_first);
+END $$;
+
+-- Makes the next block, for a month. Two million runs in a month are two thousand cells that make a part in three quarters of an hour.
+CREATE FUNCTION make_block(of_month date) RETURNS void
+LANGUAGE plpgsql SET search_path = regrind, pg_temp AS $$
+DECLARE
+    begins constant integer := (SELECT max(behind) FROM month_block);
+    ends constant integer := begins + 2000000;
+BEGIN
+    PERFORM make_partitions(begins, ends);
+    INSERT INTO month_block (first, behind, month, next) VALUES (begins, ends, of_month, begins);
+END $$;
+
+-- Makes the block of a month in advance. Where readers are in the way, a later call makes it.
+CREATE FUNCTION make_block_ahead(of_month date) RETURNS void
+LANGUAGE plpgsql SET search_path = regrind, pg_temp SET lock_timeout = '500ms' AS $$
+BEGIN
+    IF NOT EXISTS (SELECT FROM month_block WHERE month = of_month) THEN
+        PERFORM make_block(of_month);
+    END IF;
+EXCEPTION WHEN lock_not_available THEN
+    NULL;
+END $$;
+
+-- Takes numbers for runs of a month, one behind the other. Answers with the first.
+CREATE FUNCTION reserve_run_ids(at timestamptz, count integer) RETURNS integer
+LANGUAGE plpgsql SET search_path = regrind, pg_temp AS $$
+DECLARE
+    of_month constant date := date_trunc('month', at AT TIME ZONE 'UTC');
+    taken integer;
+BEGIN
+    -- One after the other, so that a block is made once.
+    PERFORM pg_advisory_xact_lock(hashtext('regrind month'));
+    FOR k IN 1..2 LOOP
+        UPDATE month_block SET next = next + count WHERE first = (SELECT first FROM month_block
+            WHERE month = of_month AND behind - next >= count ORDER BY first LIMIT 1) RETURNING next - count INTO taken;
+        EXIT WHEN FOUND;
+        PERFORM make_block(of_month);
+    END LOOP;
+    RETURN taken;
+END $$;
+
+-- The runs of today, with what is there, in a block of their own.
+DO $$
+DECLARE
+    behind_all constant integer := (SELECT coalesce(max(id), 0) + 1 FROM regrind.run);
+BEGIN
+    EXECUTE format('ALTER TABLE regrind.record ATTACH PARTITION regrind.record_before FOR VALUES FROM (0) TO (%s)', behind_all);
+    EXECUTE format('ALTER TABLE regrind.run_artefact ATTACH PARTITION regrind.run_artefact_before FOR VALUES FROM (0) TO (%s)', behind_all);
+    INSERT INTO regrind.month_block (first, behind, month, next)
+        SELECT 0, behind_all, date_trunc('month', coalesce(max(arrived_at), now()) AT TIME ZONE 'UTC'), behind_all FROM regrind.run;
+    SET LOCAL search_path = regrind, pg_temp;
+    PERFORM make_block(date_trunc('month', now() AT TIME ZONE 'UTC')::date);
+    PERFORM make_block((date_trunc('month', now() AT TIME ZONE 'UTC') + interval '1 month')::date);
+END $$;
+ALTER TABLE run ALTER COLUMN id DROP IDENTITY;
+ALTER TABLE run ALTER COLUMN id SET DEFAULT reserve_run_ids(now(), 1);
+
+CREATE OR REPLACE FUNCTION open_run(of_name text) RETURNS TABLE (id integer, records integer, head bytea, is_ended boolean)
+LANGUAGE plpgsql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
+#variable_conflict use_column
+DECLARE
+    mine integer := must_be_a_cell();
+BEGIN
+    IF NOT EXISTS (SELECT FROM run r WHERE r.cell = mine AND r.name = of_name) THEN
+        INSERT INTO run (id, cell, name) VALUES (reserve_run_ids(now(), 1), mine, of_name) ON CONFLICT (cell, name) DO NOTHING;
+        IF FOUND THEN
+            PERFORM count_usage(mine, 1, 0);
+            PERFORM make_block_ahead((date_trunc('month', now() AT TIME ZONE 'UTC') + interval '1 month')::date);
+        END IF;
+    END IF;
+    RETURN QUERY SELECT r.id, r.records, r.head, r.ended IS NOT NULL FROM run r WHERE r.cell = mine AND r.name = of_name;
+END $$;
+
+-- What is wrong with records that are to stand behind those of a run; null where nothing is. The chain is that of docs/journal.md.
+CREATE OR REPLACE FUNCTION flaw_of(r run, from_seq integer, hashes bytea[], texts text[]) RETURNS text
+LANGUAGE plpgsql SET search_path = regrind, pg_temp AS $$
+DECLARE
+    bad integer;
+    its_part text := r.part;
+BEGIN
+    IF r.archived_at IS NOT NULL THEN
+        RETURN format('the run was archived to %s; bring it back first: regrind plant unarchive', r.archive);
+    END IF;
+    IF cardinality(texts) = 0 OR cardinality(hashes) IS DISTINCT FROM cardinality(texts) THEN
+        RETURN 'there is not one hash for each record';
+    END IF;
+    SELECT from_seq + min(n)::integer - 1 INTO bad FROM (
+        SELECT n, hash, text, lag(hash, 1, r.head) OVER (ORDER BY n) AS before
+        FROM unnest(hashes, texts) WITH ORDINALITY AS u (hash, text, n)
+    ) c WHERE hash IS DISTINCT FROM
+        sha256(convert_to('regrind journal record 1' || chr(10) || encode(before, 'hex') || chr(10) || text, 'UTF8'));
+    IF bad IS NOT NULL THEN
+        RETURN format('record %s does not follow the one before it, or its content is not what was hashed', bad);
+    END IF;
+    IF from_seq = 1 THEN
+        its_part := texts[1]::json ->> 'part';
+        IF texts[1]::json -> 'payload' ->> 'run' IS DISTINCT FROM r.name THEN
+            RETURN format('record 1 begins another run than %s', r.name);
+        END IF;
+    END IF;
+    SELECT from_seq + min(n)::integer - 1 INTO bad
+        FROM unnest(texts) WITH ORDINALITY AS u (text, n), json_to_record(text::json) AS f (seq integer, kind text, part text)
+        WHERE f.seq IS DISTINCT FROM from_seq + n - 1 OR f.part IS DISTINCT FROM its_part OR (f.kind = 'begin') <> (f.seq = 1)
+            OR f.kind IS NULL OR (f.kind <> 'seal' AND r.ended IS NOT NULL);
+    IF bad IS NOT NULL THEN
+        RETURN format('record %s has another number or part than its place says, begins a second run, or stands behind the end', bad);
+    END IF;
+    RETURN NULL;
+END $$;
+
+-- ---- archive -------------------------------------------------------------------------------------------------------------
+
+-- Runs that can be archived: those of blocks of earlier months that have ended.
+CREATE VIEW archivable WITH (security_invoker = true) AS
+SELECT r.id, c.name AS cell, r.name AS run, b.month, b.first AS block, r.ended IS NOT NULL AS is_ended
+FROM month_block b JOIN run r ON r.id >= b.first AND r.id < b.behind JOIN cell c ON c.id = r.cell
+WHERE r.archived_at IS NULL AND r.records > 0;
+
+-- Removes the records and files of the runs of a block that were archived. A block without other runs is dropped as a whole. Contents that no
+-- other run names, and that taught nothing, go with them. Answers with the numbers of records and contents.
+CREATE FUNCTION remove_archived(of_block integer) RETURNS TABLE (records bigint, contents bigint)
+LANGUAGE plpgsql SET search_path = regrind, pg_temp AS $$
+#variable_conflict use_column
+DECLARE
+    b month_block%ROWTYPE;
+    is_whole boolean;
+BEGIN
+    SELECT * INTO STRICT b FROM month_block m WHERE m.first = of_block FOR UPDATE;
+    -- A run of which no record ever came is none. It begins anew if one comes.
+    DELETE FROM cycle y USING run r WHERE y.run = r.id AND r.id >= b.first AND r.id < b.behind AND r.records = 0
+        AND b.month < date_trunc('month', now() AT TIME ZONE 'UTC');
+    DELETE FROM run r WHERE r.id >= b.first AND r.id < b.behind AND r.records = 0 AND b.month < date_trunc('month', now() AT TIME ZONE 'UTC');
+    CREATE TEMP TABLE gone_run ON COMMIT DROP AS SELECT r.id, r.records FROM run r
+        WHERE r.id >= b.first AND r.id < b.behind AND r.archived_at IS NOT NULL;
+    CREATE TEMP TABLE gone_content ON COMMIT DROP AS SELECT DISTINCT a.sha256 FROM run_artefact a
+        WHERE a.run >= b.first AND a.run < b.behind AND a.run IN (SELECT id FROM gone_run);
+    records := (SELECT coalesce(sum(g.records), 0) FROM gone_run g
+        WHERE EXISTS (SELECT FROM record e WHERE e.run = g.id AND e.seq = 1));
+    is_whole := b.month < date_trunc('month', now() AT TIME ZONE 'UTC')
+        AND NOT EXISTS (SELECT FROM run r WHERE r.id >= b.first AND r.id < b.behind AND r.archived_at IS NULL);
+    IF is_whole THEN
+        -- A cell that tells of an old run waits here for a moment.
+        EXECUTE (SELECT coalesce(string_agg(format('DROP TABLE %s;', i.inhrelid::regclass), ' '), '')
+            FROM pg_inherits i JOIN pg_class p ON p.oid = i.inhrelid
+            WHERE i.inhparent IN ('record'::regclass, 'run_artefact'::regclass)
+                AND pg_get_expr(p.relpartbound, p.oid) = format('FOR VALUES FROM (%s) TO (%s)', b.first, b.behind));
+    ELSE
+        DELETE FROM record e WHERE e.run >= b.first AND e.run < b.behind AND e.run IN (SELECT id FROM gone_run);
+        DELETE FROM run_artefact a WHERE a.run >= b.first AND a.run < b.behind AND a.run IN (SELECT id FROM gone_run);
+    END IF;
+    DELETE FROM gone_content g WHERE EXISTS (SELECT FROM run_artefact a WHERE a.sha256 = g.sha256)
+        OR EXISTS (SELECT FROM lesson l WHERE l.sha256 = g.sha256) OR EXISTS (SELECT FROM artefact a WHERE a.sha256 = g.sha256 AND a.place IS NOT NULL);
+    DELETE FROM artefact_of o WHERE o.sha256 IN (SELECT g.sha256 FROM gone_content g);
+    WITH removed AS (DELETE FROM artefact a WHERE a.sha256 IN (SELECT g.sha256 FROM gone_content g) RETURNING 1)
+        SELECT count(*) INTO contents FROM removed;
+    DROP TABLE gone_run, gone_content;
+    RETURN NEXT;
+END $$;
+
+-- Makes the partitions of a block again, to which runs come back from the archive.
+CREATE FUNCTION restore_partitions(of_run integer) RETURNS void
+LANGUAGE plpgsql SET search_path = regrind, pg_temp AS $$
+DECLARE
+    b month_block%ROWTYPE;
+BEGIN
+    SELECT * INTO STRICT b FROM month_block m WHERE of_run >= m.first AND of_run < m.behind FOR UPDATE;
+    IF NOT EXISTS (SELECT FROM pg_inherits i JOIN pg_class p ON p.oid = i.inhrelid WHERE i.inhparent = 'record'::regclass
+            AND pg_get_expr(p.relpartbound, p.oid) = format('FOR VALUES FROM (%s) TO (%s)', b.first, b.behind)) THEN
+        PERFORM make_partitions(b.first, b.behind);
+    END IF;
+END $$;
+CREATE INDEX lesson_sha256 ON lesson (sha256);
+CREATE INDEX artefact_of_sha256 ON artefact_of (sha256);
+
+ALTER TABLE month_block ENABLE ROW LEVEL SECURITY;
+ALTER TABLE record ENABLE ROW LEVEL SECURITY;
+ALTER TABLE run_artefact ENABLE ROW LEVEL SECURITY;
+CREATE POLICY everything ON month_block FOR SELECT TO regrind_reader USING (true);
+CREATE POLICY own ON record FOR SELECT TO regrind_cell
+    USING (run IN (SELECT r.id FROM run r WHERE r.cell = (SELECT own_cell())));
+CREATE POLICY own ON run_artefact FOR SELECT TO regrind_cell
+    USING (run IN (SELECT r.id FROM run r WHERE r.cell = (SELECT own_cell())));
+CREATE POLICY everything ON record FOR SELECT TO regrind_reader USING (true);
+CREATE POLICY everything ON run_artefact FOR SELECT TO regrind_reader USING (true);
+GRANT SELECT ON record, run_artefact TO regrind_cell, regrind_reader;
+GRANT SELECT ON month_block, archivable TO regrind_reader;
+REVOKE EXECUTE ON FUNCTION make_partitions(integer, integer), make_block(date), make_block_ahead(date), reserve_run_ids(timestamptz, integer),
+    remove_archived(integer), restore_partitions(integer) FROM PUBLIC;
