@@ -45,7 +45,8 @@ struct OldRun {
     name: String,
     /// First day of its month, `YYYY-MM`.
     month: String,
-    is_ended: bool,
+    /// True if the run has ended, and no record has arrived for a day.
+    is_over: bool,
 }
 
 /// Writes the runs of all months before `before` to `folder`, each to `folder/YYYY-MM/CELL/RUN`, and removes their
@@ -91,14 +92,14 @@ async fn blocks(link: &DatabaseLink, before: &str) -> Result<Vec<i32>, PlantErro
 }
 
 async fn old_runs(link: &DatabaseLink, block: i32) -> Result<Vec<OldRun>, PlantError> {
-    let text = "SELECT id, cell, run, to_char(month, 'YYYY-MM'), is_ended FROM archivable WHERE block = $1 ORDER BY id";
+    let text = "SELECT id, cell, run, to_char(month, 'YYYY-MM'), is_over FROM archivable WHERE block = $1 ORDER BY id";
     let rows = link.client().query(text, &[&block]).await.map_err(refused("the runs of a month"))?;
     let run = |row: &super::Row| OldRun {
         id: row.get(0),
         cell: row.get(1),
         name: row.get(2),
         month: row.get(3),
-        is_ended: row.get(4),
+        is_over: row.get(4),
     };
     Ok(rows.iter().map(run).collect())
 }
@@ -111,8 +112,8 @@ async fn archive_run(
     folder: &Path,
     run: &OldRun,
 ) -> Result<Option<String>, PlantError> {
-    if !run.is_ended {
-        return Ok(Some("it has not ended".into()));
+    if !run.is_over {
+        return Ok(Some("it has not ended, or its last record arrived less than a day ago".into()));
     }
     let [cell, name] = [&run.cell, &run.name].map(|name| is_file_name(name).then_some(name));
     let Some((cell, name)) = cell.zip(name) else {

@@ -164,9 +164,9 @@ END $$;
 
 -- ---- archive -------------------------------------------------------------------------------------------------------------
 
--- Runs that can be archived: those of blocks of earlier months that have ended.
+-- Runs by month that are not archived. One that ended can be archived after a day: its seal comes behind its end.
 CREATE VIEW archivable WITH (security_invoker = true) AS
-SELECT r.id, c.name AS cell, r.name AS run, b.month, b.first AS block, r.ended IS NOT NULL AS is_ended
+SELECT r.id, c.name AS cell, r.name AS run, b.month, b.first AS block, r.ended IS NOT NULL AND r.arrived_at < now() - interval '1 day' AS is_over
 FROM month_block b JOIN run r ON r.id >= b.first AND r.id < b.behind JOIN cell c ON c.id = r.cell
 WHERE r.archived_at IS NULL AND r.records > 0;
 

@@ -168,6 +168,7 @@ fn weather(seed: u64, cells: usize, parts: usize) {
     let serials: Vec<String> = (1..=parts).map(|n| format!("SN-{n}")).collect();
     let serials: Vec<&str> = serials.iter().map(String::as_str).collect();
     plant.does(&[&["plant", "queue", "--recipe", "small", "--plant", "planner.toml"], &serials[..]].concat());
+    let study = Study::begin(&plant, parts);
     let mut broker = Broker::start();
     let (cells, _machines): (Vec<Cell>, Vec<Running>) =
         (1..=cells).map(|number| cell(&plant, number, &approvers, &broker)).unzip();
@@ -184,7 +185,7 @@ fn weather(seed: u64, cells: usize, parts: usize) {
         while left.load(Ordering::SeqCst) > 0 {
             assert!(began.elapsed() < 12 * PATIENCE, "seed {seed}: {} parts are left", left.load(Ordering::SeqCst));
             let a_while = Duration::from_millis(chance.random_range(50..1500));
-            match chance.random_range(0..4) {
+            match chance.random_range(0..5) {
                 0 => {
                     network.cut();
                     std::thread::park_timeout(a_while);
@@ -200,6 +201,7 @@ fn weather(seed: u64, cells: usize, parts: usize) {
                     std::thread::park_timeout(a_while);
                     broker.go_on();
                 }
+                3 => archive(&plant),
                 _ => {}
             }
             std::thread::park_timeout(2 * a_while);
@@ -212,8 +214,61 @@ fn weather(seed: u64, cells: usize, parts: usize) {
     });
     network.mend();
     println!("seed {seed}: {events} events of the weather");
+    study.is_done(&plant, parts);
+    let archived = unarchive(&plant);
+    println!("seed {seed}: {archived} runs were archived meanwhile");
     is_once_and_whole(&plant, &cells, parts, seed);
     cells.iter().for_each(|cell| is_told(cell, &broker));
+}
+
+/// Study whose worker makes runs beside the cells, through the same network.
+struct Study {
+    worker: Running,
+}
+
+impl Study {
+    fn begin(plant: &Plant, seeds: usize) -> Self {
+        plant.somebody("farm-1", "worker");
+        let file = fs::read_to_string(plant.path("farm-1.toml")).unwrap();
+        let [direct, through] = [plant.postgres.socket(), plant.path("net")].map(|path| path.display().to_string());
+        fs::write(plant.path("farm-1.toml"), file.replace(&direct, &through)).unwrap();
+        let seeds = format!("1..{seeds}");
+        plant.does(&["study", "begin", "small.toml", "--name", "beside", "--seeds", &seeds, "--plant", "planner.toml"]);
+        let work = ["study", "work", "--wait", "--plant", "farm-1.toml"];
+        Self { worker: Running::new(regrind(&work, plant.home.path())) }
+    }
+
+    /// Asserts that the worker has survived everything, and that each run of the study has a result.
+    fn is_done(mut self, plant: &Plant, seeds: usize) {
+        let done = "SELECT count(*) FROM study_job WHERE state = 'done'";
+        self.worker.until("the study", |_| (plant.sql(done) == seeds.to_string()).then_some(()));
+        self.worker.signal("KILL");
+        self.worker.end();
+    }
+}
+
+/// Archives what has ended so far, as if it were of a month long past. A run that is under way stays, and the database can
+/// be gone.
+fn archive(plant: &Plant) {
+    plant.sql("UPDATE month_block SET month = '2024-11-01' WHERE month <= now()");
+    plant.sql(
+        "UPDATE run r SET arrived_at = '2024-11-30' FROM record e
+         WHERE e.run = r.id AND e.seq = r.records AND e.text LIKE '%\"kind\":\"seal\"%' AND r.ended IS NOT NULL",
+    );
+    let arguments = ["plant", "archive", "--before", "2025-01", "--out", "old", "--plant", "owner.toml"];
+    let (code, out, errors) = crate::run(&arguments, plant.home.path());
+    assert!(matches!(code, 0 | 1), "{code}: {out}{errors}");
+}
+
+/// Brings every archived run back. Returns their number.
+fn unarchive(plant: &Plant) -> usize {
+    let places = plant.sql("SELECT archive FROM run WHERE archived_at IS NOT NULL");
+    let places: Vec<&str> = places.lines().collect();
+    for place in &places {
+        plant.does(&["audit", "verify", place]);
+        plant.does(&["plant", "unarchive", place, "--plant", "owner.toml"]);
+    }
+    places.len()
 }
 
 /// Asserts that a cell publishes another birth to the broker, whatever happened to the network and to the broker.
