@@ -21,6 +21,7 @@ use tokio::net::TcpListener;
 use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
 
+use super::compression::compression;
 use super::guard::{self, Admission, Entrance, Guard, Peer};
 use super::sessions::place;
 use super::subject::PageSubject;
@@ -193,7 +194,7 @@ async fn answer(
 }
 
 /// Returns `routes` behind the access control of `guard`, together with the routes that everybody can use (sign-in and
-/// assets).
+/// assets). Texts are compressed.
 fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
     let own = Router::new()
         .route("/token", get(guard::token))
@@ -205,6 +206,7 @@ fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
         .route("/sign-in", post(sign_in::sign_in).with_state(Arc::clone(&guard)))
         .route("/assets/{name}", get(assets::asset))
         .layer(from_fn_with_state(guard, guard::names_this_page))
+        .layer(compression())
         .layer(DefaultBodyLimit::max(LONGEST_BODY))
         .layer(from_fn(in_time))
 }

@@ -15,6 +15,7 @@ mod assets;
 mod attachment;
 mod chart;
 mod components;
+mod compression;
 mod gauge;
 mod guard;
 mod guarded_server;

@@ -2,7 +2,7 @@
 
 use std::io::{Read, Write};
 
-use regrind_testcell::http::Visitor;
+use regrind_testcell::http::{Visitor, raw};
 use serde_json::{Value, json};
 
 use crate::program::{Running, SMALL_RECIPE_POINTS, regrind, replaced, run, run_folders, small_recipe};
@@ -219,6 +219,40 @@ fn page_of_run_stays_for_viewers() {
     assert!(!run.is_over());
     run.interrupt();
     assert_eq!(run.end().0, 0);
+}
+
+/// The page of a run is sent as gzip to a browser that accepts it. Its events are not: each reaches the browser at once.
+#[test]
+fn page_is_compressed_and_its_events_are_not() {
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = CellPage::begin(home.path(), 20.0);
+    shown.run.line("grinding", |line| line.contains("grinding"));
+    let visitor = shown.visitor();
+    let request = |path: &str, version: &str| {
+        let (host, cookies) = (visitor.host(), &visitor.cookies);
+        format!("GET {path} HTTP/{version}\r\nHost: {host}\r\nCookie: {cookies}\r\nAccept-Encoding: gzip\r\n\r\n")
+    };
+    let address = format!("/runs/{}", shown.id);
+    for path in [address.as_str(), "/assets/page.js"] {
+        // By HTTP 1.0 a body without a length ends with the connection.
+        let packed = raw(&visitor.place, request(path, "1.0").as_bytes());
+        assert_eq!(packed.header("content-encoding"), ["gzip"], "{path}: {}", packed.head);
+        let file = home.path().join("answer.gz");
+        std::fs::write(&file, &packed.body).unwrap();
+        let unpacked = std::process::Command::new("gzip").arg("-dc").arg(&file).output().unwrap();
+        assert!(unpacked.status.success() && unpacked.stdout.len() > packed.body.len(), "{path}");
+    }
+    let mut events = std::net::TcpStream::connect(&visitor.place).unwrap();
+    events.write_all(request(&format!("{address}/events"), "1.1").as_bytes()).unwrap();
+    let (mut said, mut some) = (Vec::new(), [0; 4096]);
+    // The stream is open: what has arrived was not held back to be compressed.
+    while !said.windows(8).any(|of| of == b"\"pieces\"") {
+        let read = events.read(&mut some).unwrap();
+        assert!(read > 0, "{}", String::from_utf8_lossy(&said));
+        said.extend_from_slice(&some[..read]);
+    }
+    let said = String::from_utf8_lossy(&said).to_ascii_lowercase();
+    assert!(said.contains("text/event-stream") && !said.contains("content-encoding"), "{said}");
 }
 
 /// A person holds the cell without a reason. The page names this person, and takes the reason for the present state

@@ -6,7 +6,7 @@ use std::process::Command;
 use std::time::Instant;
 
 use regrind_testcell::browser::Browser;
-use regrind_testcell::http::{Answer, Visitor};
+use regrind_testcell::http::{Answer, Visitor, raw};
 use serde_json::Value;
 
 use super::records::made;
@@ -683,4 +683,69 @@ fn plant_pages_fit_phone_screen() {
         assert_eq!(wide, 0, "{path} is wider than the screen");
     }
     assert_eq!(tab.problems(&browser), Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn page_is_compressed_where_accepted() {
+    let plant = Plant::new();
+    let one = cell(&plant, "cell-1");
+    let runs: Vec<Planted> = (2..60).map(|hours| Planted { cell: one, hours, ..Planted::default() }).collect();
+    plant_runs(&plant, &runs);
+    let shown = ServedPage::serve(&plant);
+    let asked = |path: &str, accepts: &str| {
+        let (host, cookies) = (shown.visitor.host(), &shown.visitor.cookies);
+        // By HTTP 1.0 a body without a length ends with the connection.
+        raw(
+            &shown.visitor.place,
+            format!("GET {path} HTTP/1.0\r\nHost: {host}\r\nCookie: {cookies}\r\n{accepts}\r\n").as_bytes(),
+        )
+    };
+    for path in [
+        "/trend",
+        "/cells",
+        "/export.csv",
+        "/trend.dfq",
+        "/plant.css",
+        "/assets/page.css",
+        "/assets/page.js",
+        "/assets/icon.svg",
+    ] {
+        let plain = asked(path, "");
+        assert_eq!((plain.status, plain.header("content-encoding")), (200, vec![]), "{path}");
+        for accepts in ["Accept-Encoding: gzip\r\n", "Accept-Encoding: br;q=1.0, gzip;q=0.5\r\n"] {
+            let packed = asked(path, accepts);
+            if plain.body.len() < 1024 {
+                assert_eq!(packed.header("content-encoding"), Vec::<&str>::new(), "{path} is short");
+                continue;
+            }
+            assert_eq!(packed.header("content-encoding"), ["gzip"], "{path}: {}", packed.head);
+            assert!(
+                packed.header("vary").iter().any(|vary| vary.eq_ignore_ascii_case("accept-encoding")),
+                "{path}: {}",
+                packed.head
+            );
+            assert!(
+                3 * packed.body.len() < 2 * plain.body.len(),
+                "{path}: {} of {} bytes",
+                packed.body.len(),
+                plain.body.len()
+            );
+            assert!(unpacked(&plant, &packed.body) == plain.body, "{path} is another text");
+        }
+        for accepts in ["Accept-Encoding: identity\r\n", "Accept-Encoding: gzip;q=0\r\n"] {
+            assert_eq!(asked(path, accepts).header("content-encoding"), Vec::<&str>::new(), "{path}, {accepts}");
+        }
+    }
+    // A token is a secret: its answer is never compressed.
+    assert_eq!(asked("/token", "Accept-Encoding: gzip\r\n").header("content-encoding"), Vec::<&str>::new());
+}
+
+/// Unpacks gzip by an independent program.
+fn unpacked(plant: &Plant, bytes: &[u8]) -> Vec<u8> {
+    let path = plant.path("answer.gz");
+    fs::write(&path, bytes).unwrap();
+    let done = Command::new("gzip").arg("-dc").arg(&path).output().unwrap();
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    done.stdout
 }
