@@ -6,7 +6,7 @@ use super::error::{PlantError, refused};
 use super::link::DatabaseLink;
 
 /// All versions of the layout, each as a migration from the one before. A published migration never changes.
-const MIGRATIONS: [(i32, &str); 10] = [
+const MIGRATIONS: [(i32, &str); 11] = [
     (1, include_str!("migrations/0001_records.sql")),
     (2, include_str!("migrations/0002_work.sql")),
     (3, include_str!("migrations/0003_views.sql")),
@@ -17,6 +17,7 @@ const MIGRATIONS: [(i32, &str); 10] = [
     (8, include_str!("migrations/0008_queue.sql")),
     (9, include_str!("migrations/0009_limits.sql")),
     (10, include_str!("migrations/0010_months.sql")),
+    (11, include_str!("migrations/0011_summary.sql")),
 ];
 
 /// Groups of roles. Each role that signs in is a member of one group.

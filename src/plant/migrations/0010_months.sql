@@ -19,7 +19,7 @@ ALTER TABLE record RENAME TO record_before;
 ALTER INDEX record_pkey RENAME TO record_before_pkey;
 ALTER TABLE run_artefact RENAME TO run_artefact_before;
 ALTER INDEX run_artefact_pkey RENAME TO run_artefact_before_pkey;
-ALTER INDEX run_artefact_sha256 RENAME TO run_artefact_before_sha256;
+DROP INDEX run_artefact_sha256;
 DROP POLICY own ON record_before;
 DROP POLICY everything ON record_before;
 DROP POLICY own ON run_artefact_before;
@@ -41,7 +41,6 @@ CREATE TABLE run_artefact (
     bytes bigint NOT NULL,
     PRIMARY KEY (run, name, sha256)
 ) PARTITION BY RANGE (run);
-CREATE INDEX run_artefact_sha256 ON run_artefact (sha256);
 
 -- The partitions of a block. Rights are those of the whole tables: nobody reads a partition by itself.
 CREATE FUNCTION make_partitions(of_first integer, of_behind integer) RETURNS void
@@ -224,7 +223,9 @@ BEGIN
     END IF;
 END $$;
 CREATE INDEX lesson_sha256 ON lesson (sha256);
-CREATE INDEX artefact_of_sha256 ON artefact_of (sha256);
+-- The content first: an archived content is looked up here before it goes.
+ALTER TABLE artefact_of DROP CONSTRAINT artefact_of_pkey;
+ALTER TABLE artefact_of ADD PRIMARY KEY (sha256, cell);
 
 ALTER TABLE month_block ENABLE ROW LEVEL SECURITY;
 ALTER TABLE record ENABLE ROW LEVEL SECURITY;

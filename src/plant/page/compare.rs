@@ -14,7 +14,7 @@ use super::super::link::DatabaseLink;
 use super::content::{PageContent, page};
 use super::page_error::PageError;
 use super::rank::{ENOUGH, holm, rank_sum};
-use super::selection::{Selection, SelectionQuery, mark};
+use super::selection::{NEWEST_FIRST, Selection, SelectionQuery, mark};
 use super::shared::Shared;
 use super::words::{encoded, interval, share, shown, um};
 
@@ -85,9 +85,9 @@ async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Resul
     let n = values.len();
     // Reads one cell at a time, each from the end of its own index.
     let text = format!(
-        "SELECT c.name, p.pv_um, p.cycles, p.result, p.given_up FROM (SELECT name FROM cell WHERE retired_at IS NULL ORDER BY name LIMIT ${} OFFSET ${}) c
-            LEFT JOIN LATERAL (SELECT pv_um, cycles, result, given_up FROM part_run WHERE cell = c.name AND (ended IS NOT NULL OR given_up) AND {condition}
-                ORDER BY began DESC LIMIT {PARTS}) p ON true ORDER BY c.name",
+        "SELECT c.name, p.pv_um, p.cycles, p.result, p.given_up FROM (SELECT id, name FROM cell WHERE retired_at IS NULL ORDER BY name LIMIT ${} OFFSET ${}) c
+            LEFT JOIN LATERAL (SELECT pv_um, cycles, result, given_up FROM part_run WHERE cell_id = c.id AND (ended IS NOT NULL OR given_up) AND {condition}
+                ORDER BY {NEWEST_FIRST} LIMIT {PARTS}) p ON true ORDER BY c.name",
         n + 1,
         n + 2
     );

@@ -12,7 +12,7 @@ use super::super::{Row, ToSql};
 use super::control_chart::Value;
 use super::page_error::{PageError, unmade, within};
 use super::run::file;
-use super::selection::{Selection, SelectionQuery};
+use super::selection::{NEWEST_FIRST, Selection, SelectionQuery};
 use super::shared::{PlantPage, Shared};
 use super::trend::parts;
 
@@ -85,7 +85,7 @@ async fn csv_of(plant: &PlantPage, asked: &SelectionQuery) -> Result<String, Pag
         other => format!("{other}::text"),
     };
     let columns = COLUMNS.iter().map(column).collect::<Vec<_>>().join(", ");
-    let text = format!("SELECT {columns} FROM part_run WHERE {condition} ORDER BY began DESC LIMIT {MAX_PARTS}");
+    let text = format!("SELECT {columns} FROM part_run WHERE {condition} ORDER BY {NEWEST_FIRST} LIMIT {MAX_PARTS}");
     let values: Vec<_> = values.iter().map(|value| value as &(dyn ToSql + Sync)).collect();
     let rows = link.query(&text, &values).await?;
     let mut file = format!("{}\r\n", COLUMNS.join(","));

@@ -20,6 +20,11 @@ const KINDS: [(&str, &str); 6] = [
     ("wheel", "Wheel"),
     ("probe", "Probe"),
 ];
+/// Day (UTC) on which a run began, as an expression on the views. The indexes of runs have it instead of the time: a
+/// condition names it, and an order begins with it.
+pub(super) const DAY_BEGAN: &str = "(began AT TIME ZONE 'UTC')::date";
+/// Order of runs from the newest to the oldest, as the indexes of runs have it.
+pub(super) const NEWEST_FIRST: &str = "(began AT TIME ZONE 'UTC')::date DESC, began DESC";
 /// Number of days in the default period.
 const DAYS: i64 = 90;
 /// Maximum number of names in a form.
@@ -81,16 +86,20 @@ impl Selection {
         Ok(Self { names, since: day(&since)?.unwrap_or(before), until, simulated, first: at == "first" })
     }
 
-    /// Returns the selection as an SQL condition, and the values of the parameters in this condition. The parameters
+    /// Returns the selection as an SQL condition on `part_run`, and the values of the parameters in this condition. The parameters
     /// are `$1`, `$2` and so on, in the order of the values.
     pub(super) fn condition(&self) -> (String, Vec<String>) {
-        let end = self.until.checked_add(1.day()).unwrap_or(Date::MAX);
-        let mut values = vec![format!("{} 00:00Z", self.since), format!("{end} 00:00Z")];
+        let mut values = vec![self.since.to_string(), self.until.to_string()];
         let world = if self.simulated { "simulation" } else { "NOT simulation" };
-        let mut text = format!("{world} AND began >= $1::text::timestamptz AND began < $2::text::timestamptz");
+        let mut text = format!("{world} AND {DAY_BEGAN} BETWEEN $1::text::date AND $2::text::date");
         for ((column, _), name) in KINDS.iter().zip(&self.names).filter(|(_, name)| !name.is_empty()) {
             values.push(name.clone());
-            text += &format!(" AND {column} = ${}", values.len());
+            let n = values.len();
+            text += &match *column {
+                // An index has the number of the cell, and the order of its runs.
+                "cell" => format!(" AND cell_id = (SELECT id FROM cell WHERE name = ${n})"),
+                column => format!(" AND {column} = ${n}"),
+            };
         }
         (text, values)
     }
@@ -180,7 +189,8 @@ pub(super) async fn is_simulated(link: &DatabaseLink, asked: &str) -> Result<boo
 
 async fn newest_recipe(link: &DatabaseLink, simulated: bool) -> Result<String, PlantError> {
     let world = if simulated { "simulation" } else { "NOT simulation" };
-    let text = format!("SELECT recipe FROM part_run WHERE {world} AND recipe IS NOT NULL ORDER BY began DESC LIMIT 1");
+    let text =
+        format!("SELECT recipe FROM part_run WHERE {world} AND recipe IS NOT NULL ORDER BY {NEWEST_FIRST} LIMIT 1");
     let rows = link.query(&text, &[]).await?;
     Ok(rows.first().map_or_else(String::new, |row| row.get(0)))
 }
@@ -221,8 +231,12 @@ mod tests {
     fn condition_binds_names_as_parameters() {
         let hostile = "x' OR '1'='1";
         let (text, values) = selection(["", hostile, "", "", "R 5", ""]).condition();
-        assert!(!text.contains(hostile) && text.ends_with("AND cell = $3 AND wheel = $4"), "{text}");
-        assert_eq!(values, ["2026-07-01 00:00Z", "2026-07-05 00:00Z", hostile, "R 5"]);
+        assert!(
+            !text.contains(hostile)
+                && text.ends_with("AND cell_id = (SELECT id FROM cell WHERE name = $3) AND wheel = $4"),
+            "{text}"
+        );
+        assert_eq!(values, ["2026-07-01", "2026-07-04", hostile, "R 5"]);
     }
 
     #[test]

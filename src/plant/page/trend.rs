@@ -11,7 +11,7 @@ use super::super::link::DatabaseLink;
 use super::content::{PageContent, page};
 use super::control_chart::{ENOUGH, Limits, Value, individuals, moving_ranges, ranges};
 use super::page_error::PageError;
-use super::selection::{ALL_KINDS, Selection, SelectionQuery, mark};
+use super::selection::{ALL_KINDS, NEWEST_FIRST, Selection, SelectionQuery, mark};
 use super::shared::Shared;
 use super::words::{shown, um};
 
@@ -19,8 +19,15 @@ use super::words::{shown, um};
 const MAX_PARTS: i64 = 250;
 const LISTED: usize = 20;
 
-/// Condition on `part_run` that a part was judged for good.
-const FINISHED: &str = "result IN ('accepted', 'not accepted') AND ";
+/// Query of parts by their last measurement, up to its first condition: those that were judged for good.
+const LAST_MEASURED: &str = "SELECT id, serial, cell, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), pv_um, pv_u_um, pv_limit_um, rms_um, rms_u_um, rms_limit_um
+    FROM part_run WHERE result IN ('accepted', 'not accepted') AND pv_um IS NOT NULL";
+/// Query of parts by their first measurement. The limit makes the database read one cycle of each run that it shows,
+/// and never all cycles.
+const FIRST_MEASURED: &str = "SELECT id, serial, cell, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), y.pv_um, y.pv_u_um, pv_limit_um, y.rms_um, y.rms_u_um, rms_limit_um
+    FROM (SELECT id, serial, cell, cell_id, began, recipe, grinder, cmm, wheel, probe, simulation, pv_limit_um, rms_limit_um FROM part_run) p
+        CROSS JOIN LATERAL (SELECT pv_um, pv_u_um, rms_um, rms_u_um FROM cycle WHERE run = p.id AND cycle = 1 LIMIT 1) y
+    WHERE y.pv_um IS NOT NULL";
 
 /// Part with its two figures.
 pub(super) struct Part {
@@ -64,13 +71,8 @@ async fn made(plant: &Shared, asked: &SelectionQuery) -> Result<PageContent, Pag
 /// for good: the figures of a run that is under way, was stopped or broke off are those of an unfinished part.
 pub(super) async fn parts(link: &DatabaseLink, selection: &Selection, most: i64) -> Result<Vec<Part>, PlantError> {
     let (condition, values) = selection.condition();
-    // The two views have different names for the id of the run.
-    let (view, id) = if selection.first { ("cycle_figure", "run_id") } else { ("part_run", "id") };
-    let first = if selection.first { "cycle = 1 AND " } else { FINISHED };
-    let text = format!(
-        "SELECT {id}, serial, cell, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), pv_um, pv_u_um, pv_limit_um, rms_um, rms_u_um, rms_limit_um
-            FROM {view} WHERE {first}pv_um IS NOT NULL AND {condition} ORDER BY began DESC LIMIT {most}"
-    );
+    let text = if selection.first { FIRST_MEASURED } else { LAST_MEASURED };
+    let text = format!("{text} AND {condition} ORDER BY {NEWEST_FIRST} LIMIT {most}");
     let values: Vec<_> = values.iter().map(|value| value as &(dyn super::super::ToSql + Sync)).collect();
     let rows = link.query(&text, &values).await?;
     let part = |row: &super::super::Row| {

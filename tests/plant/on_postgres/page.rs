@@ -5,6 +5,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
+use regrind::journal::sha256_hex;
 use regrind_testcell::browser::Browser;
 use regrind_testcell::http::{Answer, Visitor, raw};
 use serde_json::Value;
@@ -748,4 +749,181 @@ fn unpacked(plant: &Plant, bytes: &[u8]) -> Vec<u8> {
     let done = Command::new("gzip").arg("-dc").arg(&path).output().unwrap();
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     done.stdout
+}
+
+/// Difference of the counts by day from a count of all parts: rows that only one of them has.
+const MISCOUNTED: &str = "WITH counted AS (
+        SELECT day, cell, recipe, simulation, count(*) FILTER (WHERE result = 'accepted') AS accepted,
+            count(*) FILTER (WHERE result = 'accepted' AND cycles = 1) AS accepted_at_once, count(*) FILTER (WHERE result = 'not accepted') AS not_accepted,
+            count(*) FILTER (WHERE result = 'stopped') AS stopped, count(*) FILTER (WHERE result = 'aborted') AS aborted,
+            count(*) FILTER (WHERE result = 'given up') AS given_up
+        FROM counted_part GROUP BY day, cell, recipe, simulation),
+    kept AS (SELECT * FROM parts_of_day WHERE (accepted, accepted_at_once, not_accepted, stopped, aborted, given_up) <> (0, 0, 0, 0, 0, 0))
+    SELECT 'only counted', x.* FROM (SELECT * FROM counted EXCEPT SELECT * FROM kept) x
+    UNION ALL SELECT 'only kept', x.* FROM (SELECT * FROM kept EXCEPT SELECT * FROM counted) x";
+
+/// What a cell does in one session, at random: its runs begin and end, their figures come before or after the end and
+/// again with others, parts are leased, begun and given up, and their runs end afterwards. Each step is a transaction.
+const RANDOM_STEPS: &str = r#"DO $do$
+DECLARE
+    deed float; of_run text; found record; got record; stood record; lines text[]; hashes bytea[]; line text; payload text; given text;
+    results text[] := '{accepted,"not accepted",stopped,aborted,open,recovery}';
+BEGIN
+    PERFORM set_config('search_path', 'regrind', false), setseed(SEED);
+    FOR k IN 1..STEPS LOOP
+        deed := random();
+        IF deed < 0.1 THEN
+            SELECT * INTO got FROM take_work(600);
+            IF got.id IS NOT NULL THEN
+                -- The other session may begin a run of that name.
+                BEGIN
+                    given := begin_work(got.id, got.lease, 'work-' || floor(200 * random()));
+                EXCEPTION WHEN unique_violation THEN
+                    given := 'there is a run of that name';
+                END;
+                IF given IS NOT NULL THEN
+                    PERFORM return_work(got.id, got.lease, given);
+                END IF;
+            END IF;
+        ELSIF deed < 0.16 THEN
+            SELECT w.id, w.run INTO got FROM work w WHERE w.state = 'begun' AND w.cell = own_cell() ORDER BY random() LIMIT 1;
+            IF got.id IS NOT NULL THEN
+                PERFORM give_up_work(got.id, got.run, 'broken');
+            END IF;
+        ELSE
+            of_run := coalesce((SELECT w.run FROM work w WHERE w.run IS NOT NULL AND random() < 0.5 ORDER BY random() LIMIT 1), 'run-' || floor(30 * random()));
+            SELECT * INTO stood FROM open_run(of_run);
+            IF deed < 0.45 THEN
+                PERFORM tell_run(stood.id, jsonb_build_object('result', (results || NULL::text)[1 + floor(7 * random())::int], 'alarms', 0, 'cycles',
+                    (SELECT coalesce(jsonb_agg(jsonb_build_object('cycle', c, 'pv_um', 1)), '[]') FROM generate_series(1, floor(3 * random())::int) c)));
+            ELSE
+                lines := '{}'; hashes := '{}';
+                IF stood.records = 0 THEN
+                    payload := format('{"content":{%s"part_name":"P"},"run":"%s"%s}', CASE floor(3 * random()) WHEN 0 THEN '' WHEN 1 THEN '"recipe":"lens.toml",'
+                        ELSE '"recipe":"mirror.toml",' END, of_run, CASE floor(3 * random()) WHEN 0 THEN '' WHEN 1 THEN ',"simulation":true' ELSE ',"simulation":false' END);
+                    lines := lines || format('{"actor":"a","kind":"begin","mono_ns":1,"part":"P","payload":%s,"seq":1,"utc":"%s"}', payload, now() - random() * interval '3 days');
+                END IF;
+                IF NOT stood.is_ended AND random() < 0.6 THEN
+                    lines := lines || format('{"actor":"a","kind":"end","mono_ns":1,"part":"P","payload":{},"seq":%s,"utc":"%s"}',
+                        stood.records + cardinality(lines) + 1, now() - random() * interval '3 days');
+                END IF;
+                FOREACH line IN ARRAY lines LOOP
+                    given := encode(CASE WHEN cardinality(hashes) = 0 THEN stood.head ELSE hashes[cardinality(hashes)] END, 'hex');
+                    hashes := hashes || sha256(convert_to('regrind journal record 1' || chr(10) || given || chr(10) || line, 'UTF8'));
+                END LOOP;
+                IF cardinality(lines) > 0 THEN
+                    SELECT * INTO found FROM ship(stood.id, stood.records + 1, hashes, lines);
+                END IF;
+            END IF;
+        END IF;
+        COMMIT;
+    END LOOP;
+END $do$"#;
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn counts_by_day_match_runs_after_any_events() {
+    let plant = Plant::new();
+    let cells = ["cell-1", "cell-2"];
+    for name in cells {
+        plant.cell(name, &[]);
+    }
+    plant.sql("INSERT INTO recipe (sha256, name, version, text) VALUES (recipe_sha256('mirror', 1, 'a', '{}'), 'mirror', 1, 'a')");
+    plant.sql("INSERT INTO approval (recipe, person, key, signature) SELECT sha256, 'p' || n, repeat(n::text, 64), repeat('a', 128) FROM recipe, generate_series(1, 2) n");
+    plant.sql("INSERT INTO work (serial, recipe) SELECT 'SN-' || n, sha256 FROM recipe, generate_series(1, 200) n");
+    let seed = rand::random::<u32>();
+    println!("seed {seed}");
+    for round in 0..4_u32 {
+        // Two sessions of each cell, and the owner, who changes many runs at once.
+        std::thread::scope(|scope| {
+            for (session, name) in [cells, cells].concat().into_iter().enumerate() {
+                let drawn = f64::from(seed.wrapping_add(8 * round + session as u32).wrapping_mul(2_654_435_761))
+                    / f64::from(u32::MAX);
+                let text = RANDOM_STEPS.replace("SEED", &drawn.to_string()).replace("STEPS", "150");
+                let plant = &plant;
+                scope.spawn(move || {
+                    let (role, password) = (name.replace('-', "_"), plant.password(name));
+                    // One statement, so that it can end its transactions itself.
+                    let said = plant.postgres.ask_as(&role, &password, "regrind", &text);
+                    said.unwrap_or_else(|error| panic!("seed {seed}, {name}: {error}"))
+                });
+            }
+            for k in 0..10_u32 {
+                plant.sql(&format!("UPDATE run SET result = (ARRAY['accepted', 'stopped', NULL])[1 + (id + {k}) % 3] WHERE id % 3 = {k} % 3 AND ended IS NOT NULL"));
+            }
+        });
+        assert_eq!(plant.sql(MISCOUNTED), "", "seed {seed}, round {round}");
+        let kinds = "SELECT count(*) > 10, count(*) FILTER (WHERE result = 'given up') > 0, count(*) FILTER (WHERE simulation IS NULL) > 0 FROM counted_part";
+        assert_eq!(plant.sql(kinds), "t|t|t", "seed {seed}, round {round}");
+        // Changes that only an owner makes: a run that has not ended after all, another recipe, and runs that are gone.
+        plant.sql("UPDATE run SET ended = NULL WHERE id % 5 = 0");
+        plant.sql("UPDATE run SET recipe = 'prism', simulation = NOT simulation WHERE id % 7 = 0");
+        plant.sql("DELETE FROM cycle WHERE run % 11 = 0; DELETE FROM run WHERE id % 11 = 0");
+        assert_eq!(plant.sql(MISCOUNTED), "", "seed {seed}, round {round}, by the owner");
+    }
+    // The page shows these counts.
+    let [ended, accepted] = ["ended", "accepted"]
+        .map(|of| plant.sql(&format!("SELECT sum({of}) FROM parts_by_day WHERE NOT simulation AND cell = 'cell-1'")));
+    let said = words(&ServedPage::serve(&plant).text("/?parts=real"));
+    assert!(said.contains(&format!("cell-1 {ended} {accepted} ")), "seed {seed}: {said}");
+    // The remedy for a count that somebody has changed by hand.
+    plant.sql("UPDATE parts_of_day SET accepted = accepted + 1");
+    assert_ne!(plant.sql(MISCOUNTED), "");
+    plant.sql("SELECT count_parts_again()");
+    assert_eq!(plant.sql(MISCOUNTED), "");
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn counts_by_day_begin_with_runs_of_earlier_layout() {
+    let plant = Plant::new();
+    plant.sql("DROP SCHEMA regrind CASCADE");
+    let folder = root().join("src/plant/migrations");
+    let mut files: Vec<_> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    files.sort();
+    let version = |path: &Path| path.file_name().unwrap().to_str().unwrap()[..4].parse::<i32>().unwrap();
+    let earlier: Vec<_> = files.into_iter().filter(|path| version(path) < 11).collect();
+    let mut text =
+        "CREATE SCHEMA regrind; CREATE TABLE regrind.migration (version integer PRIMARY KEY, sha256 text NOT NULL,
+            applied_at timestamptz NOT NULL DEFAULT now()); SET search_path = regrind, pg_temp; "
+            .to_owned();
+    for path in &earlier {
+        let sql = fs::read_to_string(path).unwrap();
+        text += &format!(
+            "{sql}; INSERT INTO migration (version, sha256) VALUES ({}, '{}'); ",
+            version(path),
+            sha256_hex(sql.as_bytes())
+        );
+    }
+    plant.postgres.ask_as(crate::postgres::OWNER, &plant.password("owner"), "regrind", &text).unwrap();
+    let one = cell(&plant, "cell-1");
+    let of = |result, hours| Planted { cell: one, result, hours, ..Planted::default() };
+    plant_runs(
+        &plant,
+        &[
+            of("accepted", 3),
+            of("accepted", 60),
+            of("stopped", 4),
+            of("open", 5),
+            Planted { real: false, ..of("aborted", 2) },
+        ],
+    );
+    plant.sql("UPDATE run SET ended = NULL WHERE result = 'open'");
+    plant.sql("INSERT INTO recipe (sha256, name, version, text) VALUES (recipe_sha256('mirror', 1, 'a', '{}'), 'mirror', 1, 'a')");
+    for run in ["SELECT name FROM run WHERE result = 'open'", "SELECT 'nothing-arrived'"] {
+        plant.sql(&format!(
+            "WITH made AS (INSERT INTO work (serial, recipe, state, cell, run) SELECT 'SN-UP', sha256, 'ended', 1, ({run}) FROM recipe RETURNING id)
+             INSERT INTO work_step (work, step) SELECT id, 'given up' FROM made"
+        ));
+    }
+    let counts = "SELECT simulation, sum(ended), sum(accepted) FROM parts_by_day GROUP BY 1 ORDER BY 1";
+    let before = plant.sql(counts);
+    // The newest run of the cell is simulated, and so is the part of whose run nothing arrived.
+    assert_eq!(before, "f|4|2\nt|2|0");
+    plant.does(&["plant", "init", "--plant", "owner.toml"]);
+    assert_eq!(plant.sql(counts), before);
+    assert_eq!(plant.sql(MISCOUNTED), "");
+    // It stays so when the cell makes real parts.
+    plant_runs(&plant, &[Planted { hours: 1, ..of("accepted", 1) }]);
+    assert_eq!(plant.sql(counts), "f|5|3\nt|2|0");
 }
