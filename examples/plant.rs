@@ -1,27 +1,23 @@
-//! Load test of a plant of many cells: speed of replicating records, size of the data of a thousand cells, and duration
-//! of the page's queries.
+//! Load test of a plant of many cells: speed of replicating records, and duration of the pages.
 //!
 //! ```text
 //! cargo run --release --features plant --example plant -- ship OWNER.toml RUN [CELLS [RUNS]]
-//! cargo run --release --features plant --example plant -- fill OWNER.toml RUN [CELLS [RUNS [WITH_RECORDS [REPEATED]]]]
+//! cargo run --release --features plant --example plant -- pages URL [TIMES [PATH...]]
 //! ```
 //! OWNER.toml is the plant file of the owner of a database that `regrind plant init` has laid out. Use a database for
 //! this test only: the data remain in it. RUN is the folder of a finished run. Every run here repeats its records, in a
-//! new hash chain, under another name, for another part and day. `ship` writes RUNS runs (20) into the folders of CELLS
-//! cells (8), and ships all of them at once by the roles of these cells. `fill` writes RUNS runs (518,000: 10^8 records
-//! of the shipped free-form mirror) of CELLS cells (1,000) into the tables of runs and cycles, and the records of the
-//! first WITH_RECORDS (50,000) of them into the table of records. The server copies the records of the first run into
-//! the REPEATED (0) runs that follow, with other hashes: the same number of bytes in a tenth of the time, but no valid
-//! chain.
+//! new hash chain, under another name, for another part. `ship` writes RUNS runs (20) into the folders of CELLS
+//! cells (8), and ships all of them at once by the roles of these cells. `pages` requests every page of a plant that
+//! `regrind plant fill` has filled, TIMES times (20), and prints the median. URL is the address that `regrind plant
+//! serve` prints.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use rand::rngs::StdRng;
-use rand::{RngExt, SeedableRng};
 use regrind::config::PlantConfig;
 use regrind::journal::{Reader, Record, RecordKind, restore, restore_file, sha256_hex};
 use regrind_plant::{DatabaseLink, DatabaseSettings, NewMember, Replicator, enrol_cell};
+use regrind_testcell::http::{Visitor, raw};
 
 const PASSWORD: &str = "for-measuring";
 
@@ -29,14 +25,16 @@ const PASSWORD: &str = "for-measuring";
 async fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let number = |k: usize, otherwise: usize| arguments.get(k).map_or(otherwise, |n| n.parse().expect("a number"));
-    let [what, owner, run] = [0, 1, 2].map(|k| arguments.get(k).expect("what to do, plant file, and run").as_str());
-    let plant = PlantConfig::read(Path::new(owner)).unwrap_or_else(|problems| panic!("{owner}: {problems:?}"));
-    let database = plant.database.expect("[database]");
-    let like = Like::read(Path::new(run));
-    match what {
-        "ship" => ship(&database, &like, number(3, 8), number(4, 20)).await,
-        "fill" => fill(&database, &like, number(3, 1000), number(4, 518_000), [number(5, 50_000), number(6, 0)]).await,
-        _ => panic!("ship or fill, not {what}"),
+    let argument = |k: usize, what: &str| arguments.get(k).expect(what).as_str();
+    match argument(0, "ship or pages") {
+        "ship" => {
+            let owner = argument(1, "the plant file of the owner");
+            let plant = PlantConfig::read(Path::new(owner)).unwrap_or_else(|problems| panic!("{owner}: {problems:?}"));
+            let like = Like::read(Path::new(argument(2, "the folder of a run")));
+            ship(&plant.database.expect("[database]"), &like, number(3, 8), number(4, 20)).await;
+        }
+        "pages" => pages(argument(1, "the address of the page"), number(2, 20), arguments.get(3..).unwrap_or_default()),
+        what => panic!("ship or pages, not {what}"),
     }
 }
 
@@ -52,16 +50,12 @@ impl Like {
         Self { folder: folder.to_owned(), records: reader.records(1).map(Result::unwrap).collect() }
     }
 
-    /// Returns the same records for a run with another name, part and day, in their own chain and without signatures.
-    fn again(&self, name: &str, part: &str, days: usize) -> Vec<Record> {
+    /// Returns the same records for a run with another name and part, in their own chain and without signatures.
+    fn again(&self, name: &str, part: &str) -> Vec<Record> {
         let mut head = "0".repeat(64);
-        let day = |utc: &str| {
-            let at: jiff::Timestamp = utc.parse().unwrap();
-            (at - jiff::SignedDuration::from_hours(24 * days as i64)).to_string()
-        };
         let unsigned = self.records.iter().filter(|record| record.kind != RecordKind::Seal);
         let again = unsigned.enumerate().map(|(k, of)| {
-            let mut record = Record { seq: k as u64 + 1, part: part.into(), utc: day(&of.utc), ..of.clone() };
+            let mut record = Record { seq: k as u64 + 1, part: part.into(), ..of.clone() };
             if of.kind == RecordKind::Begin {
                 let mut content = of.value();
                 content["run"] = name.into();
@@ -83,7 +77,7 @@ impl Like {
 
     /// Writes a run with this name into a folder of runs, with its files.
     fn lay(&self, runs: &Path, name: &str, part: &str) -> usize {
-        let records = self.again(name, part, 0);
+        let records = self.again(name, part);
         let folder = runs.join(name);
         let (count, files) = (records.len(), records.iter().filter(|record| record.kind == RecordKind::Artefact));
         let files: Vec<String> = files.map(|record| record.value()["name"].as_str().unwrap().to_owned()).collect();
@@ -138,86 +132,69 @@ fn files_of(like: &Like) -> usize {
     like.records.iter().filter(|record| record.kind == RecordKind::Artefact).count()
 }
 
-async fn fill(
-    database: &DatabaseSettings,
-    like: &Like,
-    cells: usize,
-    runs: usize,
-    [with_records, repeated]: [usize; 2],
-) {
-    let link = DatabaseLink::open(database).await.unwrap();
-    let began = Instant::now();
-    let text = "INSERT INTO cell (name, role) SELECT 'cell-' || n, 'cell_' || n FROM generate_series(1, $1) n ON CONFLICT DO NOTHING";
-    link.query(text, &[&(cells as i32)]).await.unwrap();
-    let first = link.query("SELECT coalesce(max(id), 0) FROM run", &[]).await.unwrap()[0].get::<_, i32>(0);
-    // About 500 parts of a thousand cells in an hour. A fifth of the recipes is made much more often than the others.
-    let text = "WITH made AS (
-            INSERT INTO run (cell, name, part, part_name, recipe, recipe_sha256, operator, simulation, began, ended, result, verdict, pv_limit_um,
-                rms_limit_um, grinder, cmm, wheel, probe, alarms, cycles, pv_um, pv_u_um, rms_um, rms_u_um, records)
-            SELECT c.id, 'run-' || n, 'SN-' || n, 'mirror', 'recipe-' || floor(40 * random() ^ 2), '00', 'operator-' || n % 70, false, t,
-                t + interval '20 minutes', CASE WHEN random() < 0.93 THEN 'accepted' ELSE 'not accepted' END, 'in tolerance', 0.5, 0.1,
-                'grinder-' || c.id % 9, 'cmm-' || c.id % 5, 'R ' || 18 + c.id % 4 || '.000 mm', 'R 1.500 mm', (random() < 0.05)::int, k,
-                0.3 + 0.1 * random(), 0.05, 0.06, 0.01, 0
-            FROM generate_series($1::int, $2::int) n
-                CROSS JOIN LATERAL (SELECT id FROM cell WHERE name = 'cell-' || 1 + n % $3::int) c
-                CROSS JOIN LATERAL (SELECT now() - make_interval(secs => 7.2 * (($4::int - n)::float8)) AS t, 1 + floor(3 * random())::int AS k) x
-            RETURNING id, cycles, pv_um)
-        INSERT INTO cycle (run, cycle, verdict, reason, pv_um, pv_u_um, rms_um, rms_u_um)
-            SELECT id, k, CASE WHEN k = cycles THEN 'accept' ELSE 'grind again' END, '', pv_um * (1 + cycles - k), 0.05, 0.06, 0.01
-            FROM made CROSS JOIN LATERAL generate_series(1, cycles) k";
-    for from in (1..=runs).step_by(10_000) {
-        let [from, to] = [from, (from + 9_999).min(runs)].map(|n| first + n as i32);
-        link.query(text, &[&from, &to, &(cells as i32), &(first + runs as i32)]).await.unwrap();
-    }
-    let made = link.query("SELECT id, name FROM run WHERE id > $1 ORDER BY id", &[&first]).await.unwrap();
-    let ids: Vec<i32> = made.iter().map(|row| row.get(0)).collect();
-    let mut random = StdRng::seed_from_u64(1);
-    let mut records = 0;
-    let (chained, others) = made.split_at(with_records.min(runs));
-    for row in chained {
-        let name: String = row.get(1);
-        let again = like.again(&name, &name.replace("run", "SN"), random.random_range(0..40));
-        let hashes: Vec<Vec<u8>> = again.iter().map(|record| bytes_of(&record.hash)).collect();
-        let texts: Vec<String> = again.iter().map(Record::text).collect();
-        let text = "INSERT INTO record (run, seq, hash, text)
-            SELECT $1, n, hash, text FROM unnest($2::bytea[], $3::text[]) WITH ORDINALITY AS u (hash, text, n)";
-        link.query(text, &[&row.get::<_, i32>(0), &hashes, &texts]).await.unwrap();
-        records += again.len();
-    }
-    let each = records / chained.len().max(1);
-    let text = "INSERT INTO record (run, seq, hash, text)
-        SELECT id, seq, sha256(hash || int4send(id)), text FROM unnest($1::int[]) id CROSS JOIN record WHERE run = $2";
-    let others = &ids[chained.len()..][..repeated.min(others.len())];
-    for some in others.chunks(100) {
-        link.query(text, &[&some, &ids[0]]).await.unwrap();
-        records += each * some.len();
-    }
-    let with_all = chained.len() + others.len();
-    link.query("ANALYZE", &[]).await.unwrap();
-    let bytes = |table: &str| {
-        let text = format!("SELECT pg_total_relation_size('{table}'), pg_relation_size('{table}')");
-        let link = &link;
-        async move {
-            let row = &link.query(&text, &[]).await.unwrap()[0];
-            [row.get::<_, i64>(0), row.get(1)].map(|bytes| bytes as f64)
-        }
+/// Times the pages of a plant: each is requested once, then `times` times. `more` are further paths, such as that of a
+/// run with whole records.
+fn pages(url: &str, times: usize, more: &[String]) {
+    let visitor = Visitor::with_key(url);
+    let get = |path: &str| {
+        let (host, cookies) = (visitor.host(), &visitor.cookies);
+        let request =
+            format!("GET {path} HTTP/1.0\r\nHost: {host}\r\nCookie: {cookies}\r\nAccept-Encoding: gzip\r\n\r\n");
+        raw(&visitor.place, request.as_bytes())
     };
-    println!(
-        "{runs} runs of {cells} cells, {records} records of {with_all}, in {:.0} s",
-        began.elapsed().as_secs_f64()
-    );
-    for (table, rows) in [("record", records), ("run", runs), ("cycle", 2 * runs)] {
-        let [total, heap] = bytes(table).await;
-        let rows = rows.max(1) as f64;
+    let parts = visitor.get("/parts").text();
+    let runs: Vec<&str> =
+        parts.split("href=\"/runs/").skip(1).filter_map(|rest| rest.split('"').next()).take(4).collect();
+    let maps = runs.iter().map(|run| format!("run={run}")).collect::<Vec<_>>().join("&");
+    let trend = visitor.get("/trend").text();
+    let chosen = |kind: &str| {
+        let options =
+            trend.split(&format!("<select name=\"{kind}\"")).nth(1).and_then(|rest| rest.split("</select>").next());
+        let values = options.unwrap_or_default().split("option value=\"").filter_map(|rest| rest.split('"').next());
+        values
+            .filter(|value| !value.trim().is_empty() && !value.starts_with('>'))
+            .last()
+            .unwrap_or_default()
+            .replace(' ', "%20")
+    };
+    let mut paths: Vec<String> = [
+        "/",
+        "/parts",
+        "/parts?serial=SIMULATION-0000",
+        "/trend",
+        "/trend?recipe=",
+        "/trend?at=first",
+        "/cells",
+        "/cells?recipe=",
+        "/export.csv",
+        "/export.csv?recipe=",
+        "/trend.dfq",
+        "/trend.dfq?recipe=",
+    ]
+    .map(str::to_owned)
+    .into();
+    for kind in ["cell", "grinder", "cmm", "wheel", "probe"] {
+        paths.push(format!("/trend?recipe=&{kind}={}", chosen(kind)));
+        paths.push(format!("/trend?{kind}={}&since=2000-01-01", chosen(kind)));
+    }
+    paths.extend([format!("/runs/{}", runs[0]), format!("/maps?{maps}")]);
+    paths.extend_from_slice(more);
+    println!("{:<60} {:>10} {:>10} {:>10} {:>10}", "page", "first, ms", "median", "slowest", "kB");
+    for path in &paths {
+        let timed = || {
+            let began = Instant::now();
+            let answer = get(path);
+            assert_eq!(answer.status, 200, "{path}: {}", answer.text());
+            (1e3 * began.elapsed().as_secs_f64(), answer.body.len())
+        };
+        let (first, bytes) = timed();
+        let mut again: Vec<f64> = (0..times).map(|_| timed().0).collect();
+        again.sort_by(f64::total_cmp);
         println!(
-            "{table:<8} {:>9.1} MB, {:.0} bytes a row, of which {:.0} are indexes",
-            total / 1e6,
-            total / rows,
-            (total - heap) / rows
+            "{path:<60} {first:>10.1} {:>10.1} {:>10.1} {:>10.1}",
+            again[times / 2],
+            again[times - 1],
+            bytes as f64 / 1e3
         );
     }
-}
-
-fn bytes_of(digits: &str) -> Vec<u8> {
-    data_encoding::HEXLOWER.decode(digits.as_bytes()).unwrap()
 }

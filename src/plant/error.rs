@@ -54,6 +54,9 @@ pub enum PlantError {
     #[error("{}: the folder for large files cannot be used: {source}; check that it exists, and that you have the \
              right to write in it", .path.display())]
     Folder { path: PathBuf, source: io::Error },
+    /// A database or a run that simulated runs cannot be made in, or of.
+    #[error("{what}; {remedy}")]
+    Fill { what: String, remedy: &'static str },
     #[error(transparent)]
     Journal(#[from] JournalError),
     #[error(transparent)]

@@ -7,6 +7,7 @@
 mod archive;
 mod copy;
 mod error;
+mod fill;
 mod knowledge;
 mod link;
 mod page;
@@ -21,6 +22,7 @@ mod work;
 pub use archive::{ArchiveResult, archive_runs, restore_run};
 pub use copy::{PlantRun, content};
 pub use error::PlantError;
+pub use fill::{Filling, RunPattern, TableSize, table_sizes};
 pub use knowledge::Knowledge;
 pub use link::DatabaseLink;
 pub use page::PlantPage;

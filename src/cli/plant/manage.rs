@@ -4,7 +4,7 @@ use clap::{Args, Subcommand};
 
 use super::super::Outcome;
 use super::super::failure::Failure;
-use super::{archive, members, queue, quota, recipes, runs, serve};
+use super::{archive, fill, members, queue, quota, recipes, runs, serve};
 
 /// Manage the database of a plant of many cells
 #[derive(Args, Debug)]
@@ -45,6 +45,7 @@ enum PlantCommand {
     Archive(archive::ToArchive),
     Unarchive(archive::ToRestore),
     Serve(serve::Arguments),
+    Fill(fill::Arguments),
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
@@ -68,5 +69,6 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         PlantCommand::Archive(of) => archive::archive(of),
         PlantCommand::Unarchive(of) => archive::unarchive(of),
         PlantCommand::Serve(of) => serve::serve(of),
+        PlantCommand::Fill(of) => fill::fill(of),
     }
 }

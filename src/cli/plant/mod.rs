@@ -6,6 +6,7 @@ mod audit;
 mod cell_monitor;
 mod confirmed_part;
 mod failure;
+mod fill;
 mod knowledge;
 mod manage;
 mod members;

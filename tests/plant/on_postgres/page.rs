@@ -12,7 +12,8 @@ use serde_json::Value;
 
 use super::records::made;
 use crate::Plant;
-use crate::program::{PATIENCE, Running, regrind, root};
+use crate::only_run;
+use crate::program::{PATIENCE, Running, regrind, root, small_recipe};
 
 /// Text that would inject an element of a page, end an attribute and an SQL string, and change the reading direction.
 const HOSTILE: &str =
@@ -926,4 +927,126 @@ fn counts_by_day_begin_with_runs_of_earlier_layout() {
     // It stays so when the cell makes real parts.
     plant_runs(&plant, &[Planted { hours: 1, ..of("accepted", 1) }]);
     assert_eq!(plant.sql(counts), "f|5|3\nt|2|0");
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn filled_plant_is_proven_and_every_query_has_an_index() {
+    let plant = Plant::new();
+    let home = plant.path("at-cell");
+    fs::create_dir(&home).unwrap();
+    let recipe = small_recipe(&home, 1000.0).display().to_string();
+    let (code, out, errors) = crate::program::run(&["run", &recipe, "--cell", "sim", "--part", "SN-0042"], &home);
+    assert_eq!(code, 0, "{out}{errors}");
+    let (folder, _) = only_run(&home.join("runs"));
+    let like = folder.display().to_string();
+    let fill = |more: &str| format!("plant fill --plant owner.toml --cells 20 --years 1 {more}");
+    let does = |command: String| plant.does(&command.split(' ').collect::<Vec<_>>());
+    let refused = |command: String| plant.ends(&command.split(' ').collect::<Vec<_>>(), 2).1;
+    let said = does(fill(&format!("--runs 12000 --seed 7 --records 40 --like {like}")));
+    assert!(said.contains("seed 7") && said.contains("12,000 runs of 20 cells"), "{said}");
+    assert_eq!(
+        plant.sql("SELECT count(*), bool_and(simulation), bool_and(name LIKE 'SIMULATION-%') FROM run"),
+        "12000|t|t"
+    );
+    assert_eq!(plant.sql("SELECT count(*), bool_and(name LIKE 'SIMULATION-%') FROM cell"), "20|t");
+    assert_eq!(
+        plant.sql("SELECT max(began) - min(began) BETWEEN interval '364 days' AND interval '367 days' FROM run"),
+        "t"
+    );
+    assert_eq!(plant.sql(MISCOUNTED), "");
+    let drawn = "SELECT md5(string_agg(pv_um || ' ' || result, ',' ORDER BY name)) FROM run WHERE records = 0";
+    let first = plant.sql(drawn);
+    // The chains, files and figures of the runs with whole records are those of the run that they repeat.
+    let whole = plant.sql("SELECT name FROM run WHERE records > 100 ORDER BY id");
+    assert_eq!(whole.lines().count(), 40, "{whole}");
+    for name in whole.lines().step_by(15) {
+        let told = plant.does(&["audit", "verify", name, "--plant", "owner.toml"]);
+        assert!(told.contains("files of SIMULATION-"), "{told}");
+    }
+    plant.sql("UPDATE record SET text = replace(text, 'SN', 'SM') WHERE seq = 5; UPDATE cycle SET pv_um = 0.1 WHERE run = (SELECT max(id) FROM run WHERE records > 0)");
+    let (_, told) = plant.ends(&["audit", "verify", whole.lines().last().unwrap(), "--plant", "owner.toml"], 1);
+    assert!(!told.is_empty());
+
+    // A seed is used once; the same seed draws the same in another database.
+    let told = refused(fill("--runs 10 --seed 7"));
+    assert!(told.contains("another seed"), "{told}");
+    does(fill("--runs 4000 --seed 8"));
+    assert_ne!(plant.sql(drawn), first);
+    // Whatever exists beside these runs, no page reads the whole table of runs: a few real ones of one cell.
+    let real = cell(&plant, "cell-1");
+    plant_runs(
+        &plant,
+        &[
+            Planted { cell: real, hours: 900, ..Planted::default() },
+            Planted { cell: real, hours: 901, result: "recovery", ..Planted::default() },
+        ],
+    );
+    let told = refused(fill("--runs 10"));
+    assert!(told.contains("cell-1") && told.contains("another database"), "{told}");
+    // Most runs of a plant come from its queue.
+    plant.sql("INSERT INTO work (serial, recipe, state, cell, run) SELECT 'SN-' || n, sha256, 'ended', 1, 'run-' || n FROM recipe, generate_series(1, 20000) n");
+    plant.sql("ANALYZE");
+    every_query_has_an_index(&plant);
+}
+
+/// Requests every page, and checks the plan of each of its queries.
+fn every_query_has_an_index(plant: &Plant) {
+    plant.somebody("page", "reader");
+    for setting in [
+        "session_preload_libraries = 'auto_explain'",
+        "auto_explain.log_min_duration = 0",
+        "auto_explain.log_analyze = on",
+    ] {
+        plant.sql(&format!("ALTER ROLE page SET {setting}"));
+    }
+    let shown = ServedPage::serve(plant);
+    let run = plant.sql("SELECT max(id) FROM run WHERE simulation");
+    let before = plant.postgres.log().len();
+    let selections = [
+        "",
+        "recipe=",
+        "recipe=mirror-1",
+        "recipe=mirror-1&cell=SIMULATION-0003",
+        "recipe=&grinder=Grinder%200003",
+        "recipe=&cmm=CMM%202",
+        "recipe=&wheel=R%2018.000%20mm",
+        "recipe=&probe=R%201.500%20mm",
+        "recipe=&cell=SIMULATION-0003",
+        "at=first",
+        "recipe=&at=first",
+        "recipe=mirror-1&at=first&since=2000-01-01",
+    ];
+    let mut pages: Vec<String> = [
+        "/",
+        "/?parts=real",
+        "/?parts=simulated",
+        "/parts",
+        "/parts?serial=SIMULATION-0000",
+        &format!("/parts?after={run}"),
+        &format!("/runs/{run}"),
+        &format!("/maps?run={run}"),
+        "/run?cell=SIMULATION-0003&name=none",
+    ]
+    .map(str::to_owned)
+    .into();
+    for selection in selections {
+        for parts in ["", "&parts=real", "&parts=simulated"] {
+            for page in ["/trend", "/cells", "/export.csv", "/trend.dfq"] {
+                pages.push(format!("{page}?{selection}{parts}"));
+            }
+        }
+    }
+    for path in &pages {
+        let status = shown.visitor.get(path).status;
+        assert!([200, 303, 404].contains(&status), "{path}: {status}");
+    }
+    let log = plant.postgres.log()[before..].to_owned();
+    assert!(log.matches("Query Text").count() > pages.len(), "the plans are in the log");
+    for table in ["run r", "run", "cycle y", "record", "run_artefact", "artefact", "work w", "work w_1", "work_step s"]
+    {
+        let scan = format!("Seq Scan on {table} ");
+        let plan = log.split("Query Text").find(|plan| plan.contains(&scan));
+        assert!(plan.is_none(), "{}", plan.unwrap());
+    }
 }
