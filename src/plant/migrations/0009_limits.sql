@@ -77,11 +77,11 @@ DECLARE
     its_words constant text := left(in_words, 2000);
     today constant timestamptz := date_trunc('day', now() AT TIME ZONE 'UTC') AT TIME ZONE 'UTC';
 BEGIN
-    -- One after the other, so that two connections of a cell neither double a row nor exceed the quota.
-    PERFORM pg_advisory_xact_lock(hashtext('regrind incident'), hashtext(session_user));
+    -- A row that another connection holds is passed over, and stands twice then: to wait for it could be a deadlock, because who complains
+    -- holds other rows.
     UPDATE incident SET times = times + 1, last_at = now() WHERE id = (SELECT id FROM incident WHERE role = session_user
         AND md5(coalesce(run, '') || chr(10) || what || chr(10) || words) = md5(coalesce(its_run, '') || chr(10) || its_kind || chr(10) || its_words)
-        ORDER BY id DESC LIMIT 1);
+        ORDER BY id DESC LIMIT 1 FOR UPDATE SKIP LOCKED);
     IF FOUND THEN
         RETURN in_words;
     END IF;
@@ -89,7 +89,8 @@ BEGIN
         INSERT INTO incident (cell, run, what, words) VALUES (own_cell(), its_run, its_kind, its_words);
         RETURN in_words;
     END IF;
-    UPDATE incident SET times = times + 1, last_at = now() WHERE role = session_user AND at >= today AND what = 'too many incidents';
+    UPDATE incident SET times = times + 1, last_at = now() WHERE id = (SELECT id FROM incident
+        WHERE role = session_user AND at >= today AND what = 'too many incidents' LIMIT 1 FOR UPDATE SKIP LOCKED);
     IF NOT FOUND THEN
         INSERT INTO incident (cell, what, words)
             VALUES (own_cell(), 'too many incidents', 'more incidents than the quota of a day; further ones of this day are only counted');
@@ -160,8 +161,9 @@ BEGIN
         RETURN QUERY SELECT r.records, r.head, flaw;
         RETURN;
     END IF;
-    PERFORM count_usage(mine, 0, sent);
     UPDATE run SET records = r.records + given, head = hashes[given], arrived_at = now() WHERE run.id = of_run;
+    -- Last, as in every function: the row of a cell and a day is never waited for by who holds it.
+    PERFORM count_usage(mine, 0, sent);
     RETURN QUERY SELECT r.records + given, hashes[given], NULL::text;
 END $$;
 
