@@ -81,7 +81,7 @@ async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<Pa
 /// shows only `CELLS` cells; if there is one more, the caller knows that a next page exists. The PV values of each cell
 /// are sorted in ascending order.
 async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Result<Vec<Cell>, PlantError> {
-    let (condition, values) = selection.condition();
+    let (condition, values) = selection.condition_within_cell();
     let n = values.len();
     // Reads one cell at a time, each from the end of its own index.
     let text = format!(

@@ -86,20 +86,32 @@ impl Selection {
         Ok(Self { names, since: day(&since)?.unwrap_or(before), until, simulated, first: at == "first" })
     }
 
-    /// Returns the selection as an SQL condition on `part_run`, and the values of the parameters in this condition. The parameters
-    /// are `$1`, `$2` and so on, in the order of the values.
+    /// Returns the selection as an SQL condition on `part_run`, and the values of the parameters in this condition. The
+    /// parameters are `$1`, `$2` and so on, in the order of the values.
     pub(super) fn condition(&self) -> (String, Vec<String>) {
+        self.condition_on(|column, n| match column {
+            // An index has the number of the cell, and the order of its runs.
+            "cell" => format!("cell_id = (SELECT id FROM cell WHERE name = ${n})"),
+            column => format!("{column} = ${n}"),
+        })
+    }
+
+    /// Returns the same as [`Selection::condition`] for a query of one cell after the other. Machines and tools are
+    /// compared without an index: the index of the cell finds its few runs, and that of a wheel finds those of all cells.
+    pub(super) fn condition_within_cell(&self) -> (String, Vec<String>) {
+        self.condition_on(|column, n| match column {
+            "recipe" => format!("recipe = ${n}"),
+            column => format!("coalesce({column}, '') = ${n}"),
+        })
+    }
+
+    fn condition_on(&self, equal: impl Fn(&str, usize) -> String) -> (String, Vec<String>) {
         let mut values = vec![self.since.to_string(), self.until.to_string()];
         let world = if self.simulated { "simulation" } else { "NOT simulation" };
         let mut text = format!("{world} AND {DAY_BEGAN} BETWEEN $1::text::date AND $2::text::date");
         for ((column, _), name) in KINDS.iter().zip(&self.names).filter(|(_, name)| !name.is_empty()) {
             values.push(name.clone());
-            let n = values.len();
-            text += &match *column {
-                // An index has the number of the cell, and the order of its runs.
-                "cell" => format!(" AND cell_id = (SELECT id FROM cell WHERE name = ${n})"),
-                column => format!(" AND {column} = ${n}"),
-            };
+            text += &format!(" AND {}", equal(column, values.len()));
         }
         (text, values)
     }

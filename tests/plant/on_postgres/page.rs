@@ -763,7 +763,7 @@ const MISCOUNTED: &str = "WITH counted AS (
     SELECT 'only counted', x.* FROM (SELECT * FROM counted EXCEPT SELECT * FROM kept) x
     UNION ALL SELECT 'only kept', x.* FROM (SELECT * FROM kept EXCEPT SELECT * FROM counted) x";
 
-/// What a cell does in one session, at random: its runs begin and end, their figures come before or after the end and
+/// Steps of a cell in one session, at random: its runs begin and end, their figures come before or after the end and
 /// again with others, parts are leased, begun and given up, and their runs end afterwards. Each step is a transaction.
 const RANDOM_STEPS: &str = r#"DO $do$
 DECLARE
@@ -1043,6 +1043,8 @@ fn every_query_has_an_index(plant: &Plant) {
     }
     let log = plant.postgres.log()[before..].to_owned();
     assert!(log.matches("Query Text").count() > pages.len(), "the plans are in the log");
+    // One cell after the other: its runs on a wheel are not sought among those of all cells.
+    assert!(!log.contains("BitmapAnd"), "two indexes at once");
     for table in ["run r", "run", "cycle y", "record", "run_artefact", "artefact", "work w", "work w_1", "work_step s"]
     {
         let scan = format!("Seq Scan on {table} ");
