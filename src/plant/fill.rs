@@ -166,18 +166,15 @@ impl Filling {
         link.client().batch_execute(RECIPE).await.map_err(&failed)?;
         let (cells, seed, runs) = (self.cells as i32, i64::from(self.seed), i64::from(self.runs));
         link.query(include_str!("fill/cells.sql"), &[&cells, &seed]).await?;
-        let before: i32 = link.query("SELECT coalesce(max(id), 0) FROM run", &[]).await?[0].get(0);
         let (until, span_s) = (Timestamp::now().to_string(), self.years * YEAR_DAYS * DAY_S);
-        let mut made = before;
         for from in (1..=runs).step_by(RUNS as usize) {
             let to = (from + RUNS - 1).min(runs);
             link.query(include_str!("fill/runs.sql"), &[&from, &to, &runs, &cells, &span_s, &until, &seed]).await?;
-            link.query(include_str!("fill/given_up.sql"), &[&made]).await?;
-            made = link.query("SELECT max(id) FROM run", &[]).await?[0].get(0);
             progress(to as u32);
         }
+        link.query(include_str!("fill/given_up.sql"), &[&self.prefix()]).await?;
         if let Some(pattern) = pattern {
-            self.make_whole(link, pattern, before).await?;
+            self.make_whole(link, pattern).await?;
         }
         link.client().batch_execute("VACUUM (ANALYZE) cell, cell_state, run, cycle, record, run_artefact, artefact, artefact_of, work, work_step, parts_of_day")
             .await
@@ -191,15 +188,20 @@ impl Filling {
             return Err(PlantError::Fill { what, remedy: "make another database for trials" });
         }
         let text = "SELECT EXISTS (SELECT FROM run r JOIN cell c ON c.id = r.cell WHERE starts_with(r.name, $1))";
-        if link.query(text, &[&format!("SIMULATION-{}-", self.seed)]).await?[0].get(0) {
+        if link.query(text, &[&self.prefix()]).await?[0].get(0) {
             let what = format!("the database has runs of the seed {}", self.seed);
             return Err(PlantError::Fill { what, remedy: "name another seed" });
         }
         Ok(())
     }
 
-    /// Gives `whole_runs` of the runs after the id `before` the records and the files of the pattern.
-    async fn make_whole(&self, link: &DatabaseLink, pattern: &RunPattern, before: i32) -> Result<(), PlantError> {
+    /// Returns the beginning of the names of all runs of this filling.
+    fn prefix(&self) -> String {
+        format!("SIMULATION-{}-", self.seed)
+    }
+
+    /// Gives `whole_runs` of the runs of this filling the records and the files of the pattern.
+    async fn make_whole(&self, link: &DatabaseLink, pattern: &RunPattern) -> Result<(), PlantError> {
         for (_, sha256, content) in &pattern.files {
             let text = "INSERT INTO artefact (sha256, bytes, content) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING";
             link.query(text, &[sha256, &(content.len() as i64), content]).await?;
@@ -209,9 +211,9 @@ impl Filling {
         link.query(text, &[&hashes]).await?;
         // Spread over all runs that ended.
         let text = "SELECT id, name, part, to_char(began AT TIME ZONE 'UTC', 'YYYY-MM-DD\"T\"HH24:MI:SS.US\"Z\"') FROM (
-                SELECT *, row_number() OVER (ORDER BY id) AS n, count(*) OVER () AS ended_runs FROM run WHERE id > $1 AND ended IS NOT NULL) r
-            WHERE n % greatest(ended_runs / greatest($2::bigint, 1), 1) = 0 ORDER BY id LIMIT $2";
-        let chosen = link.query(text, &[&before, &i64::from(self.whole_runs)]).await?;
+                SELECT *, row_number() OVER (ORDER BY name) AS n, count(*) OVER () AS ended_runs FROM run WHERE starts_with(name, $1) AND ended IS NOT NULL) r
+            WHERE n % greatest(ended_runs / greatest($2::bigint, 1), 1) = 0 ORDER BY n LIMIT $2";
+        let chosen = link.query(text, &[&self.prefix(), &i64::from(self.whole_runs)]).await?;
         for some in chosen.chunks(WHOLE_RUNS) {
             WholeRuns::new(pattern, some).store(link, pattern).await?;
         }

@@ -12,16 +12,23 @@ WITH place AS (
 ), result AS (
     SELECT k.*, CASE WHEN ending < 0.93 THEN 'accepted' WHEN ending < 0.97 THEN 'not accepted' WHEN ending < 0.985 THEN 'stopped'
         WHEN ending < 0.995 THEN 'aborted' ELSE 'open' END AS result FROM kind k
+), month AS MATERIALIZED (
+    -- The numbers of the month of each run, whose records have a partition of their own.
+    SELECT at, reserve_run_ids(at, runs::integer) AS first FROM (
+        SELECT date_trunc('month', began AT TIME ZONE 'UTC') AT TIME ZONE 'UTC' AS at, count(*) AS runs FROM result GROUP BY 1 ORDER BY 1) m
+), numbered AS (
+    SELECT r.*, m.first + row_number() OVER (PARTITION BY m.at ORDER BY n) - 1 AS id
+    FROM result r JOIN month m ON m.at = date_trunc('month', r.began AT TIME ZONE 'UTC') AT TIME ZONE 'UTC'
 ), made AS (
-    INSERT INTO run (cell, name, part, part_name, recipe, recipe_sha256, operator, simulation, began, ended, result, verdict, pv_limit_um, rms_limit_um, grinder,
+    INSERT INTO run (id, cell, name, part, part_name, recipe, recipe_sha256, operator, simulation, began, ended, result, verdict, pv_limit_um, rms_limit_um, grinder,
         cmm, wheel, probe, alarms, cycles, pv_um, pv_u_um, rms_um, rms_u_um)
-    SELECT cell, 'SIMULATION-' || $7::bigint || '-' || lpad(n::text, 8, '0'), 'SIMULATION-' || lpad(n::text, 8, '0'), 'Free-form mirror ' || recipe_number,
+    SELECT id, cell, 'SIMULATION-' || $7::bigint || '-' || lpad(n::text, 8, '0'), 'SIMULATION-' || lpad(n::text, 8, '0'), 'Free-form mirror ' || recipe_number,
         'mirror-' || recipe_number, encode(sha256(convert_to('mirror-' || recipe_number, 'UTF8')), 'hex'), 'Operator ' || n % 70, true, began,
         CASE WHEN result <> 'open' THEN began + lasts END, result,
         CASE result WHEN 'accepted' THEN 'ACCEPTED: PV and RMS within tolerance' WHEN 'open' THEN NULL ELSE upper(result) || ': simulated' END, 7, 1,
         'Grinder ' || lpad(cell_number::text, 4, '0'), 'CMM ' || cell_number / 5, 'R ' || 18 + (cell_number + extract(epoch FROM began)::bigint / 2592000) % 4 || '.000 mm',
         'R ' || 1 + cell_number % 3 || '.500 mm', (ending > 0.96)::integer, cycles, pv_um, 0.4, pv_um / 8, 0.03
-    FROM result ORDER BY n
+    FROM numbered ORDER BY n
     RETURNING id, cell, name, part, result, began, cycles, pv_um, rms_um
 )
 INSERT INTO cycle (run, cycle, verdict, reason, pv_um, pv_u_um, rms_um, rms_u_um, expected_pv_um, map)
