@@ -21,6 +21,7 @@ mod jsonl_appender;
 mod layout;
 mod learned;
 mod lens;
+mod line_file;
 mod map;
 mod maps;
 mod measured_document;
@@ -67,6 +68,7 @@ pub use height_map::HeightMap;
 pub use jsonl_appender::JsonlAppender;
 pub use learned::{CellRun, KnowledgeOrigin, Learned, LearnedError, SettingIdentity};
 pub use lens::{LensModel, LensSurface, TermsDisc, parse_lens, read_lens};
+pub use line_file::LineFile;
 pub use map::{
     CorrectionIdentities, ErrorMapOrigin, MapNode, parse_error_map, read_error_map, write_correction, write_error_map,
 };
