@@ -1,5 +1,8 @@
 //! Published state of a cell: its present state, and the result of its last run.
 
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use regrind_cell::StateName;
 use regrind_control::Snapshot;
 
 /// Published state of a cell.
@@ -7,6 +10,8 @@ use regrind_control::Snapshot;
 pub struct CellStatus {
     /// Present state.
     pub run_status: RunStatus,
+    /// True if the snapshot was built from the record of a run that has ended. It lacks what the record does not tell.
+    pub from_record: bool,
     /// Last run that ended.
     pub last_run: Option<EndedRun>,
 }
@@ -27,7 +32,7 @@ pub enum RunStatus {
         /// True if that program simulated its machines, so that they are gone too.
         machines_within: bool,
     },
-    /// A run is active.
+    /// A run is active, or has just ended. In the second case the snapshot has the state Complete, Stopped or Aborted.
     #[expect(missing_docs, reason = "named for what they are")]
     Active { run: String, snapshot: Box<Snapshot> },
 }
@@ -37,10 +42,30 @@ pub enum RunStatus {
 pub struct EndedRun {
     /// Name of the run.
     pub run: String,
+    /// Name of the result: Accepted, NotAccepted, Stopped or Aborted.
+    pub result: &'static str,
     /// Result, in words for people.
     pub verdict: String,
     /// True if the part is accepted.
     pub accepted: bool,
+    /// Time of the end, in milliseconds since 1970 in UTC.
+    pub ended_ms: u64,
+}
+
+/// Status of a cell at a time.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TimedStatus {
+    /// Status.
+    pub status: CellStatus,
+    /// Time at which the status held, in milliseconds since 1970 in UTC.
+    pub at_ms: u64,
+}
+
+impl TimedStatus {
+    /// Returns the status `status` with the present time.
+    pub fn now(status: CellStatus) -> Self {
+        Self { status, at_ms: now_ms() }
+    }
 }
 
 impl CellStatus {
@@ -63,4 +88,20 @@ impl CellStatus {
             _ => None,
         }
     }
+
+    /// Returns the PackML state of the cell: Idle if there is no run. Returns `None` if the program of the run does not
+    /// answer or is gone, because the state is then unknown.
+    pub(crate) fn state(&self) -> Option<StateName> {
+        match &self.run_status {
+            RunStatus::NoRun => Some(StateName::Idle),
+            RunStatus::Unresponsive { .. } | RunStatus::ProgramGone { .. } => None,
+            RunStatus::Active { snapshot, .. } => Some(snapshot.state),
+        }
+    }
+}
+
+/// Returns the present time in milliseconds since 1970 in UTC.
+pub(crate) fn now_ms() -> u64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
 }

@@ -2,7 +2,7 @@
 //!
 //! An unknown figure has no value: neither 0 nor an empty text.
 
-use regrind_control::{CycleRow, JobProgress};
+use regrind_control::{CycleRow, JobProgress, Snapshot};
 
 use crate::cell_status::{CellStatus, RunStatus};
 use crate::packml::{PRODUCTION, SIMULATION, state_number};
@@ -73,16 +73,10 @@ const fn text(name: &'static str, about: &'static str, of: fn(&CellStatus) -> Op
 /// All published figures of a cell.
 pub const FIGURES: &[Figure] = &[
     whole("Status/StateCurrent", "Number of the state in PackML; 4 (Idle) if no run is active", |told| {
-        match &told.run_status {
-            RunStatus::NoRun => Some(FigureValue::Whole(state_number(regrind_cell::StateName::Idle))),
-            RunStatus::Unresponsive { .. } | RunStatus::ProgramGone { .. } => None,
-            RunStatus::Active { snapshot, .. } => Some(FigureValue::Whole(state_number(snapshot.state))),
-        }
+        told.state().map(|state| FigureValue::Whole(state_number(state)))
     }),
-    text("Status/StateName", "Name of the state by PackML", |told| match &told.run_status {
-        RunStatus::NoRun => Some(FigureValue::Text("Idle".into())),
-        RunStatus::Unresponsive { .. } | RunStatus::ProgramGone { .. } => None,
-        RunStatus::Active { snapshot, .. } => Some(FigureValue::Text(snapshot.state.to_string())),
+    text("Status/StateName", "Name of the state by PackML", |told| {
+        told.state().map(|state| FigureValue::Text(state.to_string()))
     }),
     whole("Status/UnitModeCurrent", "Number of the mode by PackML: 1 production, 16 simulation", |told| {
         told.snapshot().map(|now| FigureValue::Whole(if now.simulation { SIMULATION } else { PRODUCTION }))
@@ -106,7 +100,7 @@ pub const FIGURES: &[Figure] = &[
         ))),
         RunStatus::Active { snapshot, .. } => Some(in_words(&snapshot.message)),
     }),
-    text("Next Step", "Next action of a person", |told| told.snapshot().map(|now| in_words(&now.next))),
+    text("Next Step", "Next action of a person", |told| live(told).map(|now| in_words(&now.next))),
     text("Phase", "Phase of the cycle that the cell executes, or that it will continue", |told| {
         told.snapshot()?.phase.map(|phase| in_words(phase.name()))
     }),
@@ -159,10 +153,13 @@ pub const FIGURES: &[Figure] = &[
     text(
         "Unconfirmed",
         "Machines that have not confirmed that they are at rest, in a state where the cell is considered to be at rest",
-        |told| told.snapshot().map(|now| listed(now.unconfirmed.iter().map(|device| device.name()), ", ")),
+        |told| live(told).map(|now| listed(now.unconfirmed.iter().map(|device| device.name()), ", ")),
     ),
     text("Last Run/Name", "Name of the last run that ended", |told| {
         told.last_run.as_ref().map(|last| in_words(&last.run))
+    }),
+    text("Last Run/Result", "Result of that run: Accepted, NotAccepted, Stopped or Aborted", |told| {
+        told.last_run.as_ref().map(|last| in_words(last.result))
     }),
     text("Last Run/Verdict", "Result of the last run that ended", |told| {
         told.last_run.as_ref().map(|last| in_words(&last.verdict))
@@ -184,6 +181,11 @@ fn if_known(name: &str) -> Option<FigureValue> {
     Some(name).filter(|name| !name.is_empty()).map(in_words)
 }
 
+/// Returns the snapshot if the program of the run has sent it. A record does not tell all that such a snapshot tells.
+fn live(told: &CellStatus) -> Option<&Snapshot> {
+    told.snapshot().filter(|_| !told.from_record)
+}
+
 fn job(told: &CellStatus) -> Option<JobProgress> {
     told.snapshot()?.progress
 }
@@ -199,12 +201,11 @@ fn measured(told: &CellStatus) -> Option<&CycleRow> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use regrind_control::Snapshot;
 
     fn on(snapshot: Snapshot) -> CellStatus {
         CellStatus {
             run_status: RunStatus::Active { run: "a run".into(), snapshot: Box::new(snapshot) },
-            last_run: None,
+            ..CellStatus::default()
         }
     }
 
@@ -251,7 +252,7 @@ mod tests {
     fn gone_run_has_no_state() {
         let gone = CellStatus {
             run_status: RunStatus::ProgramGone { run: "a run".into(), machines_within: false },
-            last_run: None,
+            ..CellStatus::default()
         };
         assert_eq!((value("Status/StateCurrent", &gone), value("Status/StateName", &gone)), (None, None));
         assert_eq!(value("Status/StateCurrent", &CellStatus::default()), Some(FigureValue::Whole(4)));

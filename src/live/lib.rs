@@ -2,7 +2,7 @@
 //! reported.
 //!
 //! ```text
-//!  Snapshot --> CellStatus --> FIGURES --> Sparkplug B: births, changed values, deaths --> broker
+//!  Snapshot --> TimedStatus --> FIGURES --> Sparkplug B: births, changed values, history, deaths --> broker
 //!                                       \-> OPC UA: nodes and events --> clients
 //!  PublisherEvent <-- refused requests, and whether the publisher is connected <--/
 //! ```
@@ -17,8 +17,9 @@ mod publisher_event;
 mod publisher_lock;
 mod settings;
 mod sparkplug;
+mod status_feed;
 
-pub use cell_status::{CellStatus, EndedRun, RunStatus};
+pub use cell_status::{CellStatus, EndedRun, RunStatus, TimedStatus};
 pub use error::LiveError;
 pub use figures::{FIGURES, Figure, FigureKind, FigureValue};
 pub use opcua::UaServer;
@@ -26,3 +27,4 @@ pub use publisher_event::{EventSender, PublisherEvent, event_queue};
 pub use publisher_lock::PublisherLock;
 pub use settings::{OpcUaSettings, SparkplugSettings};
 pub use sparkplug::Node;
+pub use status_feed::{StatusReceiver, StatusSender, status_feed};

@@ -19,6 +19,8 @@ pub enum PublisherEvent {
     Connected { place: String },
     /// The publisher is not connected; it retries.
     Retrying { place: String, reason: String },
+    /// This many changes were not published and are lost: they were too many or too old.
+    Dropped { place: String, changes: u64 },
     /// A client requested something that it may not do here.
     Refused { by: String, what: String },
     /// This many more refusals did not fit in the queue.
@@ -47,6 +49,11 @@ impl EventSender {
 
     pub(crate) fn retrying(&self, place: &str, reason: String) {
         let _ = self.to.try_send(PublisherEvent::Retrying { place: place.to_owned(), reason });
+    }
+
+    /// Reports lost changes. Returns false if the queue is full; the caller then reports them later.
+    pub(crate) fn dropped(&self, place: &str, changes: u64) -> bool {
+        self.to.try_send(PublisherEvent::Dropped { place: place.to_owned(), changes }).is_ok()
     }
 
     pub(crate) fn refused(&self, by: String, what: &str) {

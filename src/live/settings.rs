@@ -25,6 +25,25 @@ pub struct SparkplugSettings {
     pub password_file: Option<PathBuf>,
     /// Certificates in PEM that authenticate the broker. Without them, the broker must be on this computer.
     pub certificates: Option<PathBuf>,
+    /// Host id of the primary host, without `+`, `/` and `#`. The cell is published only while this host is online.
+    #[schemars(length(min = 1, max = 80), example = &"scada")]
+    pub primary_host: Option<String>,
+    /// Maximum number of changes that are kept while they cannot be published; the oldest are dropped.
+    #[serde(default = "default_keep_changes")]
+    #[schemars(range(min = 1, max = 1_000_000), default = "default_keep_changes")]
+    pub keep_changes: u32,
+    /// Time for which such changes are kept, in hours.
+    #[serde(default = "default_keep_hours")]
+    #[schemars(range(min = 1, max = 8760), default = "default_keep_hours")]
+    pub keep_hours: u32,
+}
+
+fn default_keep_changes() -> u32 {
+    50_000
+}
+
+fn default_keep_hours() -> u32 {
+    168
 }
 
 /// OPC UA server that shows the cell and accepts no writes.

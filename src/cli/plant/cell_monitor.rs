@@ -83,6 +83,12 @@ impl CellMonitor {
         &self.status
     }
 
+    /// Returns true if the status holds now. Returns false if a run gives no answer for a short time, and the status is
+    /// the last known one.
+    pub(super) fn is_confirmed(&self) -> bool {
+        self.silent.is_none() || matches!(self.status.run_status, RunStatus::Unresponsive { .. })
+    }
+
     /// Stores `now` as the status of the run. The caller has received this status from the active run.
     pub(super) fn set_run_status(&mut self, now: RunStatus) {
         (self.status.run_status, self.silent) = (now, None);
@@ -131,12 +137,9 @@ impl CellMonitor {
             return;
         }
         match run_summary(run) {
-            Ok(RunSummary { ended: Some(_), result, verdict, .. }) => {
-                let accepted = result == RunResult::Accepted;
-                self.status = CellStatus {
-                    run_status: RunStatus::NoRun,
-                    last_run: Some(EndedRun { run: name(run), verdict, accepted }),
-                };
+            Ok(summary) if summary.ended.is_some() => {
+                let last_run = ended_run(run, &summary);
+                self.status = CellStatus { run_status: RunStatus::NoRun, last_run, ..CellStatus::default() };
             }
             Ok(_) if is_driven(run) => return self.does_not_answer(run.clone()),
             Ok(RunSummary { machines_within, .. }) => {
@@ -164,6 +167,23 @@ impl CellMonitor {
         self.known.insert(run.to_owned(), (at, last));
         last
     }
+}
+
+/// Returns the end of the run in the folder `run` with the summary `summary`. Returns `None` if the record has no end, or
+/// is that of a recovery.
+pub(super) fn ended_run(run: &Path, summary: &RunSummary) -> Option<EndedRun> {
+    let ended: Timestamp = summary.ended.as_ref()?.parse().ok()?;
+    let accepted = match summary.result {
+        RunResult::Open | RunResult::Recovery => return None,
+        result => result == RunResult::Accepted,
+    };
+    Some(EndedRun {
+        run: name(run),
+        result: summary.result.name(),
+        verdict: summary.verdict.clone(),
+        accepted,
+        ended_ms: u64::try_from(ended.as_millisecond()).unwrap_or_default(),
+    })
 }
 
 /// Returns the folders of the active runs in the folder `runs`. A run is active if a cell listens for orders at the

@@ -1,5 +1,8 @@
 //! `regrind tell`: publishes the status of this cell by Sparkplug B or OPC UA, in parallel with the work of the cell.
 
+mod follower;
+mod run_ends;
+
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -8,19 +11,21 @@ use regrind::config::PlantConfig;
 use regrind::drive::Request;
 use regrind_control::OnBehalf;
 use regrind_live::{
-    CellStatus, EventSender, LiveError, Node, PublisherEvent, PublisherLock, RunStatus, UaServer, event_queue,
+    EventSender, LiveError, Node, PublisherEvent, PublisherLock, StatusReceiver, UaServer, event_queue, status_feed,
 };
 use serde_json::json;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
 use super::super::failure::Failure;
 use super::super::{Outcome, check, outside};
-use super::cell_monitor::{CellMonitor, live_runs, name};
+use super::cell_monitor::live_runs;
 use super::plant_file::read;
 use super::replicate;
+use follower::Follower;
+use run_ends::RunEnds;
 
-/// Time between two searches for a run, and between two tries for the publisher lock.
+/// Time between two tries for the publisher lock.
 const ROUND: Duration = Duration::from_secs(1);
 /// Time for which the result of an ended run is still published.
 const LINGERS: Duration = Duration::from_secs(3);
@@ -35,8 +40,9 @@ const MINUTE: Duration = Duration::from_secs(60);
 #[command(after_help = "\
 The tables [sparkplug] and [opcua] of the plant file name the receivers. The command runs until you stop it,
 also without an active run. The command accepts no orders: written values and received commands are refused, reported
-here, and recorded in the active run. `regrind run --plant` starts this command by itself. docs/live.md
-lists every value.
+here, and recorded in the active run. Changes that cannot be published are kept, also after the end of this command,
+and are published later as historical values (Sparkplug B). `regrind run --plant` starts this command by itself.
+docs/live.md lists every value.
 
 Example:
   regrind tell --plant plant.toml --runs /srv/runs
@@ -126,16 +132,19 @@ async fn publish(
     arguments: &Arguments,
     ended: impl Future<Output = ()>,
 ) -> Result<Outcome, Failure> {
-    let mut look = CellMonitor::new(&arguments.runs);
-    let (to, told) = watch::channel(look.poll().clone());
+    let folder = config.path().with_extension("live");
+    let path = folder.join("ended");
+    let ends = RunEnds::open(&arguments.runs, path).map_err(|source| LiveError::Folder { path: folder, source })?;
+    let (to, told) = status_feed();
     let (notes, news) = event_queue();
     let mut telling = begin(config, cell, turn, &told, &notes)?;
-    // Only the publishers keep the senders and receivers of events.
+    // Only the publishers keep the receivers of statuses and the senders of events.
     drop((told, notes));
     let mut hearing = tokio::spawn(print_events(news, arguments.runs.clone(), arguments.json));
+    let mut follower = Follower::new(&arguments.runs, ends, to);
     let over = tokio::select! {
         Some(over) = telling.join_next() => Some(over),
-        never = follow(look, &arguments.runs, &to) => match never {},
+        never = follower.follow() => match never {},
         () = async {
             ended.await;
             if arguments.while_stdin {
@@ -143,7 +152,11 @@ async fn publish(
             }
         } => None,
     };
-    drop(to);
+    if over.is_none() {
+        // A run that gives no answer does not delay the end.
+        let _ = tokio::time::timeout(FAREWELL, follower.publish_once()).await;
+    }
+    drop(follower);
     let farewell = async { while telling.join_next().await.is_some() {} };
     // A receiver that does not read the closing messages detects the end by other means.
     let _ = tokio::time::timeout(FAREWELL, farewell).await;
@@ -165,54 +178,17 @@ fn begin(
     config: &PlantConfig,
     cell: &str,
     turn: &PublisherLock,
-    told: &watch::Receiver<CellStatus>,
+    told: &StatusReceiver,
     notes: &EventSender,
 ) -> Result<JoinSet<Result<(), LiveError>>, Failure> {
     let mut telling = JoinSet::new();
     if let Some(settings) = &config.sparkplug {
-        telling.spawn(Node::new(settings, cell, turn, told.clone(), notes.clone())?.run());
+        telling.spawn(Node::new(settings, cell, turn, told.another(), notes.clone())?.run());
     }
     if let Some(settings) = &config.opcua {
-        telling.spawn(UaServer::new(settings, cell, turn, told.clone(), notes.clone())?.run());
+        telling.spawn(UaServer::new(settings, cell, turn, told.another(), notes.clone())?.run());
     }
     Ok(telling)
-}
-
-// ---- published status ---------------------------------------------------------------------------------------------
-
-enum Never {}
-
-/// Sends every new status of the cell to the publishers through the channel `to`. If a run in the folder `runs` is
-/// active, sends each status of this run until the run no longer answers. Between runs, reads the status of the cell
-/// with the monitor `look`, every [`ROUND`]. Never returns.
-async fn follow(mut look: CellMonitor, runs: &Path, to: &watch::Sender<CellStatus>) -> Never {
-    loop {
-        if let Some(folder) = live_runs(runs).next() {
-            watch_run(&folder, &mut look, to).await;
-        }
-        look = look.poll_in_background().await;
-        publish_status(look.status(), to);
-        tokio::time::sleep(ROUND).await;
-    }
-}
-
-/// Sends each status of the active run in `folder` to the publishers through the channel `to`, if the status has
-/// changed. Also stores the status in the monitor `look`. Returns when the run ends or no longer answers.
-async fn watch_run(folder: &Path, look: &mut CellMonitor, to: &watch::Sender<CellStatus>) {
-    let Ok(mut watch) = regrind_control::watch(folder).await else { return };
-    while let Ok(Some(snapshot)) = watch.next().await {
-        look.set_run_status(RunStatus::Active { run: name(folder), snapshot: Box::new(snapshot) });
-        publish_status(look.status(), to);
-    }
-}
-
-fn publish_status(now: &CellStatus, to: &watch::Sender<CellStatus>) {
-    to.send_if_modified(|told| {
-        told != now && {
-            told.clone_from(now);
-            true
-        }
-    });
 }
 
 // ---- returned events ----------------------------------------------------------------------------------------------
@@ -238,6 +214,14 @@ async fn print_events(mut news: mpsc::Receiver<PublisherEvent>, runs: PathBuf, j
                     json,
                     &json!({ "waits": place, "why": reason }),
                     &format!("not publishing to {place}: {reason}; the cell continues, and this program tries again"),
+                ),
+                PublisherEvent::Dropped { place, changes } => say(
+                    json,
+                    &json!({ "dropped": changes, "for": place }),
+                    &format!(
+                        "{changes} changes for {place} are lost: they were too many or too old; raise `keep_changes` \
+                         or `keep_hours` in [sparkplug]"
+                    ),
                 ),
                 PublisherEvent::Refused { by, what } if quota.takes(Instant::now()) => {
                     refuse(&runs, json, &by, &what).await

@@ -8,7 +8,7 @@ use opcua_types::{
 use regrind_cell::Alarm;
 use regrind_control::{CycleRow, Snapshot};
 
-use crate::cell_status::{CellStatus, RunStatus};
+use crate::cell_status::{CellStatus, RunStatus, TimedStatus};
 
 /// Severities of events, from 1 to 1000.
 const OF_INTEREST: u16 = 100;
@@ -75,10 +75,18 @@ pub(super) struct CellEvent {
 /// `on` is the last published status with an active run. It can be older than `before`, because the run can be
 /// interrupted. If `on` belongs to the same run as `now`, only results and alarms that are not in `on` are returned. A
 /// run that continues after an interruption therefore repeats no event.
-pub(super) fn events_between([before, on]: [&CellStatus; 2], now: &CellStatus, own: u16, cell: &str) -> Vec<CellEvent> {
+pub(super) fn events_between(
+    [before, on]: [&CellStatus; 2],
+    now: &TimedStatus,
+    own: u16,
+    cell: &str,
+) -> Vec<CellEvent> {
     let from = |kind: &EventKind, severity, message: String, values: Vec<Variant>| {
-        CellEvent::new((kind, own), cell, severity, &message, values)
+        let mut event = CellEvent::new((kind, own), cell, severity, &message, values);
+        event.base.time = super::nodes::time(now.at_ms);
+        event
     };
+    let now = &now.status;
     let mut events = Vec::new();
     if let RunStatus::Active { run, snapshot } = &now.run_status {
         let earlier = on.snapshot().filter(|_| on.run() == Some(run));
@@ -200,7 +208,8 @@ mod tests {
             level_um: 0.0,
         };
         let snapshot = Snapshot { cycles: (1..=cycles).map(row).collect(), ..Snapshot::default() };
-        CellStatus { run_status: RunStatus::Active { run: run.into(), snapshot: Box::new(snapshot) }, last_run: None }
+        let run_status = RunStatus::Active { run: run.into(), snapshot: Box::new(snapshot) };
+        CellStatus { run_status, ..CellStatus::default() }
     }
 
     fn cycles(before: &CellStatus, now: &CellStatus) -> Vec<Variant> {
@@ -209,7 +218,8 @@ mod tests {
 
     fn cycles_since(before: [&CellStatus; 2], now: &CellStatus) -> Vec<Variant> {
         let name = [QualifiedName::new(2, "Cycle")];
-        let events = events_between(before, now, 2, "cell-1");
+        let now = TimedStatus { status: now.clone(), at_ms: 0 };
+        let events = events_between(before, &now, 2, "cell-1");
         events.iter().map(|event| event.get_value(AttributeId::Value, &NumericRange::None, &name)).collect()
     }
 
@@ -221,7 +231,7 @@ mod tests {
         assert_eq!(cycles(&CellStatus::default(), &on("b", 1)), [Variant::UInt32(1)]);
         let gone = CellStatus {
             run_status: RunStatus::ProgramGone { run: "a".into(), machines_within: false },
-            last_run: None,
+            ..CellStatus::default()
         };
         assert!(cycles_since([&gone, &on("a", 2)], &on("a", 2)).is_empty(), "it was left, and is gone on with");
         // A cycle that was measured again has other results.

@@ -11,6 +11,8 @@
 //!
 //! A node with an unknown value has no value and the status BadNoData.
 
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use async_trait::async_trait;
 use opcua_core::sync::RwLock;
 use opcua_nodes::{EventNotifier, ObjectBuilder, ObjectTypeBuilder, ReferenceDirection, VariableBuilder};
@@ -20,18 +22,17 @@ use opcua_server::diagnostics::NamespaceMetadata;
 use opcua_server::node_manager::memory::{
     InMemoryNodeManager, InMemoryNodeManagerImpl, InMemoryNodeManagerImplBuilder,
 };
-use opcua_server::node_manager::{RequestContext, ServerContext, WriteNode};
+use opcua_server::node_manager::{ParsedReadValueId, RequestContext, ServerContext, WriteNode};
 use opcua_types::{
     DataTypeId, DataValue, DateTime, EUInformation, ExtensionObject, LocalizedText, NodeId, ObjectId, ObjectTypeId,
-    QualifiedName, ReferenceTypeId, StatusCode, VariableTypeId, Variant,
+    QualifiedName, ReferenceTypeId, StatusCode, TimestampsToReturn, VariableTypeId, Variant,
 };
 use regrind_cell::StateName;
 
 use super::events::{ALL, KINDS};
-use crate::cell_status::{CellStatus, RunStatus};
+use crate::cell_status::TimedStatus;
 use crate::figures::{FIGURES, Figure, FigureKind, FigureValue};
 use crate::packml::state_number;
-use crate::publisher_event::EventSender;
 
 const PACKML: &str = "http://opcfoundation.org/UA/PackML/";
 const OWN: &str = "urn:regrind:live";
@@ -62,7 +63,6 @@ pub(super) struct Namespaces {
 /// Builder of the nodes of a cell.
 pub(super) struct CellNodesBuilder {
     pub(super) cell: String,
-    pub(super) notes: EventSender,
 }
 
 /// Nodes of a cell; clients cannot write them.
@@ -70,7 +70,8 @@ pub(super) struct CellNodes {
     pub(super) namespaces: Namespaces,
     metadata: Vec<NamespaceMetadata>,
     cell: String,
-    notes: EventSender,
+    /// Time of the last status of the cell, in milliseconds since 1970. The values of the nodes held at this time.
+    confirmed_ms: AtomicU64,
 }
 
 impl CellNodes {
@@ -108,7 +109,7 @@ impl InMemoryNodeManagerImplBuilder for CellNodesBuilder {
         let mut tree = Tree { space, namespaces };
         tree.types();
         tree.objects(&self.cell);
-        CellNodes { namespaces, metadata: metadata.into(), cell: self.cell, notes: self.notes }
+        CellNodes { namespaces, metadata: metadata.into(), cell: self.cell, confirmed_ms: AtomicU64::new(0) }
     }
 }
 
@@ -124,29 +125,44 @@ impl InMemoryNodeManagerImpl for CellNodes {
         self.metadata.clone()
     }
 
-    /// Rejects every write of a client: sets the status `BadNotWritable` for each node of `nodes`, and reports the
-    /// client, the node and the value to the publisher's event channel. Always returns `Ok`.
-    async fn write(
+    /// Reads values. The server time of a value is the time at which the cell last confirmed the value, not only the time
+    /// of its last change.
+    async fn read_values(
         &self,
         context: &RequestContext,
-        _space: &RwLock<AddressSpace>,
+        space: &RwLock<AddressSpace>,
+        nodes: &[&ParsedReadValueId],
+        max_age: f64,
+        wanted: TimestampsToReturn,
+    ) -> Vec<DataValue> {
+        let space = space.read();
+        let confirmed = time(self.confirmed_ms.load(Ordering::Relaxed));
+        let confirmed = |value: DataValue| DataValue {
+            server_timestamp: value.server_timestamp.map(|at| at.max(confirmed)),
+            ..value
+        };
+        nodes.iter().map(|node| confirmed(space.read(context, node, max_age, wanted))).collect()
+    }
+
+    /// Refuses every write of a client: sets the status of each node of `nodes`. Always returns `Ok`.
+    async fn write(
+        &self,
+        _context: &RequestContext,
+        space: &RwLock<AddressSpace>,
         nodes: &mut [&mut WriteNode],
     ) -> Result<(), StatusCode> {
-        let by = {
-            let session = context.session().read();
-            format!(
-                "the OPC UA client {} ({})",
-                session.session_name(),
-                session.application_description().application_uri
-            )
-        };
-        for node in nodes {
-            let wanted = node.value();
-            let value = wanted.value.value.as_ref().map_or_else(|| "nothing".to_owned(), |value| value.to_string());
-            self.notes.refused(by.clone(), &format!("write: {} = {value}", wanted.node_id));
-            node.set_status(StatusCode::BadNotWritable);
-        }
+        refuse_writes(space, nodes);
         Ok(())
+    }
+}
+
+/// Refuses to write: sets the status `BadNotWritable` for each node of `nodes` that is in `space`, and `BadNodeIdUnknown`
+/// for every other.
+pub(super) fn refuse_writes(space: &RwLock<AddressSpace>, nodes: &mut [&mut WriteNode]) {
+    let space = space.read();
+    for node in nodes {
+        let exists = space.node_exists(&node.value().node_id);
+        node.set_status(if exists { StatusCode::BadNotWritable } else { StatusCode::BadNodeIdUnknown });
     }
 }
 
@@ -356,27 +372,39 @@ fn unit_of(unit: &str) -> EUInformation {
 pub(super) fn set(
     shown: &InMemoryNodeManager<CellNodes>,
     subscriptions: &SubscriptionCache,
-    before: Option<&CellStatus>,
-    now: &CellStatus,
+    before: Option<&TimedStatus>,
+    now: &TimedStatus,
 ) {
-    let then = DateTime::now();
+    let TimedStatus { status, at_ms } = now;
     let namespaces = shown.inner().namespaces;
-    let known = |value: Option<Variant>| value.map_or_else(|| unknown(then), |value| good(value, then));
+    let known = |value: Option<Variant>, then| value.map_or_else(|| unknown(then), |value| good(value, then));
     let mut values = Vec::new();
     for figure in FIGURES {
-        let value = figure.value(now);
-        if before.is_none_or(|before| figure.value(before) != value) {
-            values.push((NodeId::new(namespaces.own, figure.name), known(value.map(variant))));
+        let value = figure.value(status);
+        if before.is_none_or(|before| figure.value(&before.status) != value) {
+            let ended_ms =
+                status.last_run.as_ref().filter(|_| figure.name.starts_with("Last Run/")).map(|run| run.ended_ms);
+            let then = time(ended_ms.unwrap_or(*at_ms));
+            let value = DataValue { server_timestamp: Some(time(*at_ms)), ..known(value.map(variant), then) };
+            values.push((NodeId::new(namespaces.own, figure.name), value));
         }
     }
-    if before.is_none_or(|before| state(before) != state(now)) {
-        for (path, value) in states(state(now), namespaces.packml) {
-            values.push((NodeId::new(namespaces.own, path), known(value)));
+    if before.is_none_or(|before| before.status.state() != status.state()) {
+        for (path, value) in states(status.state(), namespaces.packml) {
+            values.push((NodeId::new(namespaces.own, path), known(value, time(*at_ms))));
         }
     }
     let all = values.iter().map(|(node, value)| (node, None, value.clone()));
     // All these nodes were created with the tree, so this cannot fail.
     let _ = shown.set_values(subscriptions, all);
+    shown.inner().confirmed_ms.fetch_max(*at_ms, Ordering::Relaxed);
+}
+
+/// Returns the time `ms`, in milliseconds since 1970 in UTC, for OPC UA.
+pub(super) fn time(ms: u64) -> DateTime {
+    const BETWEEN_1601_AND_1970_MS: i64 = 11_644_473_600_000;
+    let since_1601_ms = i64::try_from(ms).unwrap_or(i64::MAX).saturating_add(BETWEEN_1601_AND_1970_MS);
+    DateTime::from(since_1601_ms.saturating_mul(10_000))
 }
 
 fn variant(value: FigureValue) -> Variant {
@@ -388,7 +416,8 @@ fn variant(value: FigureValue) -> Variant {
     }
 }
 
-fn good(value: Variant, then: DateTime) -> DataValue {
+/// Returns the known value `value`, which holds since `then`.
+pub(super) fn good(value: Variant, then: DateTime) -> DataValue {
     DataValue {
         value: Some(value),
         status: Some(StatusCode::Good),
@@ -400,16 +429,6 @@ fn good(value: Variant, then: DateTime) -> DataValue {
 
 fn unknown(then: DateTime) -> DataValue {
     DataValue { status: Some(StatusCode::BadNoData), ..good(Variant::Empty, then) }
-}
-
-/// Returns the PackML state of the cell for the status `told`. Returns Idle if there is no run. Returns `None` if the
-/// program of the run does not answer or is gone, because the state is then unknown.
-fn state(told: &CellStatus) -> Option<StateName> {
-    match &told.run_status {
-        RunStatus::NoRun => Some(StateName::Idle),
-        RunStatus::Unresponsive { .. } | RunStatus::ProgramGone { .. } => None,
-        RunStatus::Active { snapshot, .. } => Some(snapshot.state),
-    }
 }
 
 /// One of the three state machines of OPC 30050.

@@ -1,36 +1,37 @@
 //! Messages of an edge node: births, changes and deaths; and the requests in a host's command.
 
-use std::time::{SystemTime, UNIX_EPOCH};
-
 use srad_types::constants::{BDSEQ, NODE_CONTROL_REBIRTH};
 use srad_types::payload::metric::Value;
 use srad_types::payload::{DataType, Message as _, Metric, Payload, PropertySet, PropertyValue, property_value};
 
-use crate::figures::{Figure, FigureKind, FigureValue};
-
-/// Values of the figures, in their order.
-pub(super) type Values = Vec<Option<FigureValue>>;
+use super::change::{Change, Values};
+use crate::cell_status::now_ms;
+use crate::figures::{FIGURES, Figure, FigureKind, FigureValue};
 
 /// Encodes a Sparkplug birth certificate (NBIRTH). The message contains every figure (a quantity that the cell
-/// publishes) with its current value, type and properties. `values` holds the values in the order of `figures`.
-/// `connection` is the number of the connection (bdSeq). The sequence number of the message is 0.
-pub(super) fn birth(figures: &[Figure], values: &Values, connection: u8) -> Vec<u8> {
-    let rebirth = Metric { value: Some(Value::BooleanValue(false)), ..plain(NODE_CONTROL_REBIRTH, DataType::Boolean) };
+/// publishes) with its value, type and properties. `values` holds the values in the order of the figures, which held at
+/// the time `at_ms`, in milliseconds since 1970. `connection` is the number of the connection (bdSeq). The sequence
+/// number of the message is 0.
+pub(super) fn birth(values: &Values, at_ms: u64, connection: u8) -> Vec<u8> {
+    let rebirth =
+        Metric { value: Some(Value::BooleanValue(false)), ..plain(NODE_CONTROL_REBIRTH, DataType::Boolean, now_ms()) };
     let mut metrics = vec![number_of(connection), rebirth];
-    let told = figures.iter().zip(values);
-    metrics
-        .extend(told.map(|(figure, value)| Metric { properties: Some(properties(figure)), ..metric(figure, value) }));
+    let told = FIGURES.iter().zip(values);
+    metrics.extend(
+        told.map(|(figure, value)| Metric { properties: Some(properties(figure)), ..metric(figure, value, at_ms) }),
+    );
     encoded(metrics, Some(0))
 }
 
-/// Encodes a Sparkplug data message (NDATA). The message contains only the figures (quantities that the cell publishes)
-/// whose new value in `values` differs from the last published value in `told`. Both lists have the order of `figures`.
-/// `sequence` is the sequence number of the message. Returns `None` if no value differs.
-pub(super) fn changes(figures: &[Figure], values: &Values, told: &Values, sequence: u8) -> Option<Vec<u8>> {
-    let all = figures.iter().zip(values).zip(told);
-    let changed: Vec<_> =
-        all.filter(|((_, value), told)| value != told).map(|((figure, value), _)| metric(figure, value)).collect();
-    (!changed.is_empty()).then(|| encoded(changed, Some(sequence)))
+/// Encodes a Sparkplug data message (NDATA) with the values of `change` and their own time. `sequence` is the sequence
+/// number of the message. `historical` is true for values that a host must not take for the present ones.
+pub(super) fn data(change: &Change, sequence: u8, historical: bool) -> Vec<u8> {
+    let told = change.values.iter().filter_map(|(of, value)| Some((FIGURES.get(*of)?, value)));
+    let metrics = told.map(|(figure, value)| Metric {
+        is_historical: historical.then_some(true),
+        ..metric(figure, value, change.at_ms)
+    });
+    encoded(metrics.collect(), Some(sequence))
 }
 
 /// Encodes a Sparkplug death certificate (NDEATH) as bytes. This message tells host applications that the published
@@ -74,17 +75,17 @@ fn in_words(metric: &Metric) -> String {
 }
 
 fn number_of(connection: u8) -> Metric {
-    Metric { value: Some(Value::LongValue(connection.into())), ..plain(BDSEQ, DataType::Int64) }
+    Metric { value: Some(Value::LongValue(connection.into())), ..plain(BDSEQ, DataType::Int64, now_ms()) }
 }
 
-fn metric(figure: &Figure, value: &Option<FigureValue>) -> Metric {
+fn metric(figure: &Figure, value: &Option<FigureValue>, at_ms: u64) -> Metric {
     let kind = match figure.kind {
         FigureKind::Whole => DataType::UInt32,
         FigureKind::Number => DataType::Double,
         FigureKind::Truth => DataType::Boolean,
         FigureKind::Text => DataType::String,
     };
-    let mut metric = plain(figure.name, kind);
+    let mut metric = plain(figure.name, kind, at_ms);
     metric.value = value.as_ref().map(|value| match value {
         FigureValue::Whole(value) => Value::IntValue(*value),
         FigureValue::Number(value) => Value::DoubleValue(*value),
@@ -95,9 +96,9 @@ fn metric(figure: &Figure, value: &Option<FigureValue>) -> Metric {
     metric
 }
 
-fn plain(name: &str, kind: DataType) -> Metric {
+fn plain(name: &str, kind: DataType, at_ms: u64) -> Metric {
     let mut metric = Metric::new();
-    metric.set_name(name.to_owned()).set_datatype(kind).set_timestamp(now_ms());
+    metric.set_name(name.to_owned()).set_datatype(kind).set_timestamp(at_ms);
     metric
 }
 
@@ -125,9 +126,4 @@ fn properties(figure: &Figure) -> PropertySet {
 fn encoded(metrics: Vec<Metric>, sequence: Option<u8>) -> Vec<u8> {
     let seq = sequence.map(u64::from);
     Payload { timestamp: Some(now_ms()), metrics, seq, uuid: None, body: None }.encode_to_vec()
-}
-
-fn now_ms() -> u64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
 }

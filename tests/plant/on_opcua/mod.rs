@@ -6,7 +6,7 @@ use std::path::Path;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::held::{held_run, until_recorded};
+use crate::held::{ended_run, held_run, move_run, until_recorded};
 use crate::peers::Peer;
 use crate::program::{Running, regrind, run};
 
@@ -189,7 +189,6 @@ fn opcua_values_and_refused_writes() {
         let station = until_recorded(&mut running, &folder, &refused);
         assert!(station.contains("urn:example.org:FreeOpcUa"), "{station}");
     }
-    assert_ne!(asked(&mut client, &json!({ "call": "Start" }), "call")["result"], "Good");
     assert_eq!(read(&mut client, &["Status/StateCurrent"])["Status/StateCurrent"]["value"], 11);
 
     let (code, out, errors) = run(&["resume", &folder.display().to_string()], home.path());
@@ -204,6 +203,149 @@ fn opcua_values_and_refused_writes() {
     teller.signal("TERM");
     assert_eq!(teller.end().0, 0);
     answer(&mut client, 0, "lost");
+}
+
+/// Asserts that each of the times `names` of `value` lies between `from` and `to`, all in seconds since 1970.
+fn within(value: &Value, names: &[&str], from: &Value, to: &Value) {
+    for name in names {
+        let [time, from, to] = [&value[name], from, to].map(|time| time.as_f64().unwrap_or(f64::NAN));
+        assert!(from <= time && time <= to, "{name}: {value} is not between {from} and {to}");
+    }
+}
+
+#[test]
+#[ignore = "needs Python with venv, and asyncua: see REGRIND_PYTHON"]
+fn opcua_times_are_true() {
+    const CURRENT_TIME: &str = "i=2258";
+    const SERVER_STATUS: &str = "i=2256";
+    let home = home();
+    let (mut teller, url) = start_publishing(home.path());
+    let mut client = client(home.path(), &url);
+    let look = |client: &mut Peer, names: &[&str]| asked(client, &json!({ "read": names }), "read");
+
+    // The clock of the server runs, and each time belongs to it.
+    let start = look(&mut client, &["Message"]);
+    for _ in 0..2 {
+        let read = look(&mut client, &[CURRENT_TIME, SERVER_STATUS]);
+        for name in [CURRENT_TIME, SERVER_STATUS] {
+            within(&read["read"][name], &["value", "source", "server"], &read["before"], &read["after"]);
+        }
+    }
+    let began = asked(&mut client, &json!({ "clock": true }), "clock")["began"].take();
+    for name in ["CurrentTime", "ServerStatus"] {
+        let times = client.until(0, &format!("three times of {name}"), |said| {
+            let times: Vec<_> = said.iter().filter(|line| line["changed"] == name).cloned().collect();
+            (times.len() >= 3).then_some(times)
+        });
+        for time in &times {
+            within(time, &["value", "source", "server"], &began, &time["received"]);
+        }
+        assert!(times.is_sorted_by(|a, b| a["value"].as_f64() < b["value"].as_f64()), "{times:?}");
+    }
+
+    // A value that does not change keeps the time of its change, and the server knows it to hold later.
+    let first = start["read"]["Message"].clone();
+    within(&first, &["source", "server"], &json!(0), &start["after"]);
+    loop {
+        let later = look(&mut client, &["Message"])["read"]["Message"].take();
+        assert_eq!((&later["value"], &later["source"]), (&first["value"], &first["source"]));
+        assert!(later["server"].as_f64() >= first["server"].as_f64(), "{later} {first}");
+        if later["server"].as_f64() > first["server"].as_f64() {
+            break;
+        }
+    }
+    // A fixed property too.
+    let unit = look(&mut client, &["Figures/PV/EngineeringUnits"]);
+    within(&unit["read"]["Figures/PV/EngineeringUnits"], &["source", "server"], &json!(1e9), &unit["after"]);
+
+    // A change has the time at which it happened.
+    asked(&mut client, &json!({ "subscribe": LOOKED_AT, "events": "Cell" }), "subscribed");
+    let before = look(&mut client, &["Message"])["after"].take();
+    let (mut running, folder, _) = held_run(home.path(), 200.0);
+    let held = client.until(0, "that it is held", |said| {
+        said.iter().find(|line| line["changed"] == "Status/StateCurrent" && line["value"] == 11).cloned()
+    });
+    within(&held, &["source", "server"], &before, &held["received"]);
+    let from = client.place();
+    let (code, out, errors) = run(&["stop", &folder.display().to_string(), "--reason", "seen"], home.path());
+    assert_eq!(code, 0, "{out}{errors}");
+    running.end();
+    client.until(from, "that no run is on", |said| {
+        said.iter().any(|line| line["changed"] == "Status/StateCurrent" && line["value"] == 4).then_some(())
+    });
+    let summary = regrind::report::run_summary(&folder).unwrap();
+    let ended: jiff::Timestamp = summary.ended.unwrap().parse().unwrap();
+    let last = read(&mut client, &["Last Run/Verdict"])["Last Run/Verdict"].take();
+    assert_eq!(last["value"], json!(summary.verdict));
+    let source_ms = (1e3 * last["source"].as_f64().unwrap()).round();
+    assert_eq!(source_ms, ended.as_millisecond() as f64, "the time of the end, in ms");
+    teller.signal("TERM");
+    assert_eq!(teller.end().0, 0);
+}
+
+#[test]
+#[ignore = "needs Python with venv, and asyncua: see REGRIND_PYTHON"]
+fn opcua_end_state_without_a_look() {
+    let home = home();
+    let (mut teller, url) = start_publishing(home.path());
+    let mut client = client(home.path(), &url);
+    asked(&mut client, &json!({ "subscribe": ["Status/StateCurrent", "Run"], "events": "Cell" }), "subscribed");
+    let elsewhere = TempDir::new().unwrap();
+    let name = ended_run(elsewhere.path(), "accepted");
+    let summary = regrind::report::run_summary(&elsewhere.path().join("runs").join(&name)).unwrap();
+    move_run(elsewhere.path(), &name, home.path());
+    until_changed(&mut client, "Status/StateCurrent", &json!(17));
+    until_changed(&mut client, "Run", &json!(name));
+    let ended =
+        events(&mut client, "end of the run", |event| event["Run"] == json!(name) && !event["Verdict"].is_null());
+    assert_eq!((&ended[0]["Verdict"], &ended[0]["Accepted"]), (&json!(summary.verdict), &json!(true)));
+    let results = events(&mut client, "results", |event| !event["Cycle"].is_null());
+    assert_eq!(results.len(), summary.cycles.len(), "{results:?}");
+    assert_eq!(results.last().unwrap()["PV"], read_pv(&summary));
+    client.until(0, "that no run is on", |said| {
+        let states = said.iter().filter(|line| line["changed"] == "Status/StateCurrent");
+        let states: Vec<_> = states.map(|line| line["value"].as_u64().unwrap()).collect();
+        (states.last() == Some(&4) && states.len() > 1).then(|| assert_eq!(states, [4, 17, 4]))
+    });
+    teller.signal("TERM");
+    assert_eq!(teller.end().0, 0);
+}
+
+#[test]
+#[ignore = "needs Python with venv, and asyncua: see REGRIND_PYTHON"]
+fn opcua_refused_calls_recorded() {
+    let home = home();
+    let (mut teller, url) = start_publishing(home.path());
+    let mut client = client(home.path(), &url);
+    let (mut running, folder, _) = held_run(home.path(), 200.0);
+    let write = |node: &str| json!({ "write": node, "type": "Double", "value": 1.5 });
+    // The first eight in a minute are recorded one by one.
+    for (order, kind, refused) in [
+        (json!({ "call": "Start", "with": [7] }), "call", "call: ns=3;s=Start of ns=3;s=Cell (7)"),
+        (json!({ "call": "Figures/PV", "of": "Figures" }), "call", "call: ns=3;s=Figures/PV of ns=3;s=Figures ()"),
+        (json!({ "call": "ns=77;i=5", "of": "ns=78;i=6" }), "call", "call: ns=77;i=5 of ns=78;i=6 ()"),
+        // A method of the standard that changes the server, and the type of an object.
+        (json!({ "call": "i=12873", "of": "i=2253" }), "call", "call: i=12873 of i=2253 ()"),
+        (write("Absent"), "write", "write: ns=3;s=Absent = 1.5"),
+        (write("ns=77;s=Absent"), "write", "write: ns=77;s=Absent = 1.5"),
+        (write("i=2258"), "write", "write: i=2258 = 1.5"),
+        (json!({ "add": "New" }), "add", "New below ns=3;s=Cell"),
+    ] {
+        let told = asked(&mut client, &order, kind);
+        assert_ne!(told["result"], "Good", "{told}");
+        teller.line(refused, |line| line.contains("\"refused\"") && line.contains(refused));
+        let station = until_recorded(&mut running, &folder, refused);
+        assert!(station.contains("urn:example.org:FreeOpcUa"), "{station}");
+    }
+    // The others are counted.
+    let told = asked(&mut client, &json!({ "delete": "Figures/PV" }), "delete");
+    assert!(told["result"].as_array().unwrap().iter().all(|code| code != "Good"), "{told}");
+    teller.line("the number", |line| line.contains("\"refused\"") && line.contains("1 further requests"));
+    until_recorded(&mut running, &folder, "1 further requests");
+    assert_eq!(read(&mut client, &["Status/StateCurrent"])["Status/StateCurrent"]["value"], 11);
+    running.signal("KILL");
+    teller.signal("TERM");
+    assert_eq!(teller.end().0, 0);
 }
 
 fn read_pv(summary: &regrind::report::RunSummary) -> Value {

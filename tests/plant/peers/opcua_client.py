@@ -6,6 +6,7 @@
 import asyncio
 import json
 import sys
+from datetime import datetime, timezone
 
 from asyncua import Client, ua
 from asyncua.common.events import get_filter_from_event_type
@@ -28,9 +29,35 @@ def plain(value):
     return value
 
 
+def seconds(time):
+    """A time as seconds since 1970, as the clock of this client counts them."""
+    return time.replace(tzinfo=time.tzinfo or timezone.utc).timestamp() if time else None
+
+
+def now():
+    return datetime.now(timezone.utc).timestamp()
+
+
 def told(data):
-    return {"value": plain(data.Value.Value), "status": data.StatusCode.name, "type": data.Value.VariantType.name,
-            "when": str(data.SourceTimestamp)}
+    value = data.Value.Value
+    if isinstance(value, ua.ServerStatusDataType):
+        value = value.CurrentTime
+    if isinstance(value, datetime):
+        value = seconds(value)
+    return {"value": plain(value), "status": data.StatusCode.name, "type": data.Value.VariantType.name,
+            "source": seconds(data.SourceTimestamp), "server": seconds(data.ServerTimestamp)}
+
+
+async def with_both_times(client, nodes):
+    """What the nodes have. asyncua by itself asks for the time of the source alone."""
+    wanted = ua.ReadParameters(TimestampsToReturn=ua.TimestampsToReturn.Both)
+    for node in nodes:
+        wanted.NodesToRead.append(ua.ReadValueId(NodeId=node.nodeid, AttributeId=ua.AttributeIds.Value))
+    return await client.uaclient.read(wanted)
+
+
+# Variables of every server that have the present time.
+CLOCK = {"CurrentTime": ua.NodeId(ua.ObjectIds.Server_ServerStatus_CurrentTime), "ServerStatus": ua.NodeId(ua.ObjectIds.Server_ServerStatus)}
 
 
 class Looks:
@@ -38,7 +65,7 @@ class Looks:
         self.names = names
 
     def datachange_notification(self, node, _value, data):
-        say(changed=self.names[node.nodeid], **told(data.monitored_item.Value))
+        say(changed=self.names[node.nodeid], received=now(), **told(data.monitored_item.Value))
 
     def event_notification(self, event):
         fields = {name: plain(value) for name, value in vars(event).items() if not name.startswith("_")}
@@ -73,10 +100,18 @@ async def walk(node, path, found):
 
 async def does(client, order, state):
     own = state["own"]
-    node = lambda name: client.get_node(ua.NodeId(name, own))
+    # A name is a node of the cell; "ns=..." and "i=..." are others.
+    node = lambda name: client.get_node(name if name.startswith(("ns=", "i=")) else ua.NodeId(name, own))
     if "read" in order:
-        found = {name: told(await node(name).read_data_value(raise_on_bad_status=False)) for name in order["read"]}
-        say(read=found)
+        before = now()
+        values = await with_both_times(client, [node(name) for name in order["read"]])
+        say(read={name: told(value) for name, value in zip(order["read"], values)}, before=before, after=now())
+    elif "clock" in order:
+        looks = Looks({place: name for name, place in CLOCK.items()})
+        state["clock"] = await client.create_subscription(100, looks)
+        began = now()
+        await state["clock"].subscribe_data_change([client.get_node(place) for place in CLOCK.values()])
+        say(clock=True, began=began)
     elif "browse" in order:
         packml = await client.get_namespace_index(PACKML)
         objects = await client.nodes.objects.get_child(f"{packml}:PackMLObjects")
@@ -103,10 +138,19 @@ async def does(client, order, state):
             say(write=order["write"], result=type(error).__name__)
     elif "call" in order:
         try:
-            await node("Cell").call_method(ua.NodeId(order["call"], own))
+            await node(order.get("of", "Cell")).call_method(node(order["call"]).nodeid, *order.get("with", []))
             say(call=order["call"], result="Good")
         except ua.UaStatusCodeError as error:
             say(call=order["call"], result=type(error).__name__)
+    elif "add" in order:
+        try:
+            await node("Cell").add_variable(ua.NodeId(order["add"], own), order["add"], 1.0)
+            say(add=order["add"], result="Good")
+        except ua.UaStatusCodeError as error:
+            say(add=order["add"], result=type(error).__name__)
+    elif "delete" in order:
+        found = await client.delete_nodes([node(order["delete"])])
+        say(delete=order["delete"], result=[code.name for code in found[1]])
 
 
 async def orders(client, state):

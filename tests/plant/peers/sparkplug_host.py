@@ -1,7 +1,9 @@
 """A host of Sparkplug B on pysparkplug: prints what it hears as lines of JSON, and sends the commands that are written to it.
 
-It keeps account as a host does: of what is alive, of the numbers in a row, and of which birth a death belongs to. What does not fit is printed
-as a fault.
+It keeps account as a host does: of what is alive, of the numbers in a row, of which birth a death belongs to, and of the order of the times of
+present and of historical values. What does not fit is printed as a fault. `metrics` are the present values, `history` the historical ones.
+
+{"state": {"host": ID, "online": true, "timestamp": MS}} publishes the state of a primary host.
 
     sparkplug_host.py PORT GROUP NODE [CERTIFICATES USER PASSWORD]
 """
@@ -28,12 +30,20 @@ class Account:
     def __init__(self):
         self.birth = None
         self.sequence = None
+        self.times = {}
+
+    def in_order(self, name, historical, when):
+        """The values of a metric come in the order of their times: the present ones, and those of the history of a session."""
+        last = self.times.get((name, historical), 0)
+        if when is None or when < last:
+            say(fault=f"{name} of {when} behind that of {last}, history {historical}")
+        self.times[name, historical] = when or last
 
     def take(self, kind, payload, metrics):
         if kind == "NBIRTH":
             if payload.seq != 0:
                 say(fault=f"a birth with the number {payload.seq}")
-            self.birth, self.sequence = metrics.get("bdSeq"), 0
+            self.birth, self.sequence, self.times = metrics.get("bdSeq"), 0, {}
         elif kind == "NDATA":
             if self.birth is None:
                 say(fault="data of a node that is not alive")
@@ -53,8 +63,15 @@ class Host(Client):
         message = super()._handle_message(mqtt_message)
         kind = message.topic.message_type.value
         found = [message.payload.bd_seq_metric] if kind == "NDEATH" else message.payload.metrics
-        metrics = {metric.name: metric.value for metric in found}
+        metrics = {metric.name: metric.value for metric in found if not metric.is_historical}
+        history = {metric.name: metric.value for metric in found if metric.is_historical}
+        times = {metric.name: metric.timestamp for metric in found}
         self.account.take(kind, message.payload, metrics)
+        if history and kind != "NDATA":
+            say(fault=f"history in {kind}")
+        # The broker keeps a death since the begin of the connection.
+        for metric in found if kind != "NDEATH" else []:
+            self.account.in_order(metric.name, metric.is_historical, metric.timestamp)
         raw = Payload.FromString(mqtt_message.payload)
         units = {metric.name: value.string_value for metric in raw.metrics
                  for key, value in zip(metric.properties.keys, metric.properties.values) if key == "engUnit"}
@@ -62,7 +79,8 @@ class Host(Client):
         unsaid = [metric.name for metric in raw.metrics if not metric.is_null and metric.WhichOneof("value") is None]
         if unsaid:
             say(fault=f"neither a value nor none: {unsaid}")
-        say(heard=kind, seq=getattr(message.payload, "seq", None), metrics=metrics, units=units, nulls=nulls,
+        say(heard=kind, seq=getattr(message.payload, "seq", None), metrics=metrics, history=history, times=times, units=units, nulls=nulls,
+            qos=int(message.qos), sent=message.payload.timestamp,
             types={metric.name: metric.datatype.name for metric in found}, retained=bool(message.retain))
         return message
 
@@ -88,6 +106,10 @@ def main():
     host.connect("localhost", port=int(port), keepalive=5)
     for line in sys.stdin:
         order = json.loads(line)
+        if "state" in order:
+            state = order["state"]
+            host._client.publish(f"spBv1.0/STATE/{state.pop('host')}", json.dumps(state), qos=1, retain=True)
+            continue
         if "raw" in order:
             host._client.publish(f"spBv1.0/{group}/NCMD/{node}", bytes.fromhex(order["raw"]), qos=1)
             continue
