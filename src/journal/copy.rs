@@ -7,7 +7,7 @@ use serde_json::Value;
 use super::artefact::{path_within, write_file};
 use super::canonical::canonical_json;
 use super::error::JournalError;
-use super::names::ANCHOR;
+use super::names::{ANCHOR, is_plain_path};
 use super::record::Record;
 use super::verify::Anchor;
 use super::{open, system};
@@ -56,7 +56,8 @@ pub fn restore(
     records: impl IntoIterator<Item = Record>,
     anchor: Option<&Anchor>,
 ) -> Result<(), JournalError> {
-    if !open::is_free(folder)? {
+    // A link leads to a folder that another person may have chosen.
+    if folder.is_symlink() || !open::is_free(folder)? {
         return Err(JournalError::Exists { path: folder.to_owned() });
     }
     system::create_run_folder(folder).map_err(JournalError::file(folder, "creating the folder"))?;
@@ -80,10 +81,15 @@ pub fn restore(
 /// existing file is replaced. Does not compare `content` with the recorded hash.
 ///
 /// # Errors
-/// [`JournalError::Name`] if `name` leads out of the folder or is a file of the journal itself. The folder cannot be
-/// written.
+/// [`JournalError::Name`] if `name` can lead out of the folder on any system ([`is_plain_path`]) or through a link, or is
+/// a file of the journal itself. The folder cannot be written.
 pub fn restore_file(folder: &Path, name: &str, content: &[u8]) -> Result<(), JournalError> {
-    write_file(&path_within(folder, name)?, content)
+    let path = path_within(folder, name)?;
+    let above = path.ancestors().skip(1).take_while(|above| *above != folder);
+    if !is_plain_path(name) || path.is_symlink() || above.into_iter().any(Path::is_symlink) {
+        return Err(JournalError::Name { name: name.to_owned() });
+    }
+    write_file(&path, content)
 }
 
 #[cfg(test)]
@@ -127,6 +133,31 @@ mod tests {
         assert_eq!(verify_against(&to, &against).unwrap(), there);
         assert!(restore(&to, [], None).is_err(), "a folder in use");
         assert!(restore_file(&to, "../points.csv", b"").is_err() && restore_file(&to, "journal.sqlite", b"").is_err());
+    }
+
+    #[test]
+    fn restored_files_stay_in_their_folder() {
+        let home = tempfile::tempdir().unwrap();
+        let folder = home.path().join("run");
+        restore(&folder, [], None).unwrap();
+        for name in ["../a", "/a", "C:a", "a\nb", "\u{1b}a", "Journal.SQLITE", "a/nul", "a/."] {
+            let refused = restore_file(&folder, name, b"a");
+            assert!(matches!(refused, Err(JournalError::Name { .. })), "{name:?}: {refused:?}");
+        }
+        restore_file(&folder, "cycle-1/a.csv", b"a").unwrap();
+        #[cfg(unix)]
+        {
+            let elsewhere = tempfile::tempdir().unwrap();
+            std::os::unix::fs::symlink(elsewhere.path(), folder.join("cycle-2")).unwrap();
+            std::os::unix::fs::symlink(elsewhere.path().join("b"), folder.join("b.csv")).unwrap();
+            std::os::unix::fs::symlink(elsewhere.path(), home.path().join("link")).unwrap();
+            for name in ["cycle-2/a.csv", "b.csv"] {
+                let refused = restore_file(&folder, name, b"a");
+                assert!(matches!(refused, Err(JournalError::Name { .. })), "{name:?}: {refused:?}");
+            }
+            assert!(matches!(restore(&home.path().join("link"), [], None), Err(JournalError::Exists { .. })));
+            assert_eq!(std::fs::read_dir(elsewhere.path()).unwrap().count(), 0);
+        }
     }
 
     #[test]

@@ -53,7 +53,7 @@ pub use excerpt::Excerpt;
 pub use key::{AuditKey, PublicKey};
 pub use lost::may_be_lost;
 pub use machine::MachineLock;
-pub use names::{ANCHOR, DATABASE, LOCK};
+pub use names::{ANCHOR, DATABASE, LOCK, is_plain_name, is_plain_path};
 pub use open::{free_bytes, is_open_to_all};
 pub use reader::{Reader, Stamp, has_record, stamp};
 pub use record::{Entry, Record, RecordKind, Records};

@@ -2,12 +2,12 @@
 //! record.
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use data_encoding::HEXLOWER;
 use regrind_journal::{
-    Anchor, Begin, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Seal, Verified, restore,
-    restore_file, verify_against,
+    Anchor, Begin, ExternalEvidence, JournalError, PublicKey, Reader, Record, RecordKind, Seal, Verified,
+    is_plain_name, is_plain_path, restore, restore_file, verify_against,
 };
 use serde_json::Value;
 
@@ -84,13 +84,26 @@ impl PlantRun {
         Err(PlantError::Differs { run: self.name.clone(), what })
     }
 
+    /// Returns the path of the folder in `out` that has the name of the run. The cell gave this name.
+    ///
+    /// # Errors
+    /// [`PlantError::UnsafeName`] if the name can lead to another folder on any system.
+    pub fn folder_in(&self, out: &Path) -> Result<PathBuf, PlantError> {
+        // A name that begins with a dot is that of no run: such folders are hidden.
+        self.require_safe(&self.name, is_plain_name(&self.name) && !self.name.starts_with('.'))?;
+        Ok(out.join(&self.name))
+    }
+
     /// Fetches the records and files of the run from the plant into the new folder `folder`. `artefacts` names the
     /// folder with the large files. Skips each file that the plant does not have. Does not verify the records: call
     /// [`regrind_journal::verify`] for this.
     ///
     /// # Errors
-    /// The run was archived, the folder is in use, a record is missing, the text of a record does not have the form that a journal writes, or
-    /// the plant cannot be reached.
+    /// - [`PlantError::Archived`] if the run was archived.
+    /// - [`PlantError::UnsafeName`] if the name of a file can lead to another folder on any system. The cell gave these
+    ///   names. Nothing is written then.
+    /// - The folder is in use, a record is missing, the text of a record does not have the form that a journal writes, or
+    ///   the plant cannot be reached.
     pub async fn fetch(
         &self,
         link: &DatabaseLink,
@@ -100,18 +113,26 @@ impl PlantRun {
         if let Some(place) = self.archive.clone() {
             return Err(PlantError::Archived { cell: self.cell.clone(), run: self.name.clone(), place });
         }
+        let text = "SELECT name, sha256 FROM run_artefact WHERE run = $1 ORDER BY name";
+        let files = link.client().query(text, &[&self.id]).await.map_err(refused("the files of a run"))?;
+        for row in &files {
+            self.require_safe(row.get(0), is_plain_path(row.get(0)))?;
+        }
         let records = self.records(link, folder).await?;
         let anchor = last_sealed(&records);
         restore(folder, records, anchor.as_ref())?;
-        let failed = refused("the files of a run");
-        let text = "SELECT name, sha256 FROM run_artefact WHERE run = $1 ORDER BY name";
-        for row in link.client().query(text, &[&self.id]).await.map_err(failed)? {
-            let (name, sha256): (&str, &[u8]) = (row.get(0), row.get(1));
-            if let Some(content) = content(link, artefacts, sha256).await? {
-                restore_file(folder, name, &content)?;
+        for row in &files {
+            if let Some(content) = content(link, artefacts, row.get(1)).await? {
+                restore_file(folder, row.get(0), &content)?;
             }
         }
         Ok(())
+    }
+
+    fn require_safe(&self, name: &str, is_safe: bool) -> Result<(), PlantError> {
+        let refused =
+            || PlantError::UnsafeName { cell: self.cell.clone(), run: self.name.clone(), name: name.to_owned() };
+        if is_safe { Ok(()) } else { Err(refused()) }
     }
 
     /// Returns all records of the run from the plant, in the order of their numbers. `folder` is only used in error
@@ -203,7 +224,7 @@ pub async fn content(
         (None, Some(_), Some(kept)) => {
             // The path is built from the hash here too, so a text in a table cannot lead to another file.
             let name = HEXLOWER.encode(sha256);
-            let path = kept.folder.join(&name[..2]).join(&name);
+            let path = kept.folder.join(name.get(..2).unwrap_or_default()).join(&name);
             // A network share that is gone can hang, so the read runs in a blocking thread and other work continues.
             let at = path.clone();
             let read = tokio::task::spawn_blocking(move || fs::read(at));

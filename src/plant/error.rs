@@ -45,6 +45,11 @@ pub enum PlantError {
         "{}: the plant has no archived run with this name and this record; to list the runs: regrind plant runs", .folder.display()
     )]
     NotArchived { folder: PathBuf },
+    #[error(
+        "{run:?} of the cell {cell:?} is not fetched: {name:?} is no plain name and can lead to another folder; no program of Regrind writes such a \
+         name: ask who keeps this cell, and do not use the run"
+    )]
+    UnsafeName { cell: String, run: String, name: String },
     #[error("{0}")]
     Recipe(String),
     #[error("{name}: {what}")]

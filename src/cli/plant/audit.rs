@@ -73,7 +73,8 @@ fn prove(plant: &Path, run: Option<&Path>, keys: &[PublicKey], json: bool) -> Re
         let found = PlantRun::find(&link, config.cell.as_deref(), &named).await?;
         let place = std::env::temp_dir().join(format!("regrind-{:032x}", rand::random::<u128>()));
         let scratch = ScratchFolder::at(place)?;
-        let copy = scratch.path().join(&found.name);
+        // The name of a run comes from a cell, so it is not used as the name of a folder.
+        let copy = scratch.path().join("run");
         found.fetch(&link, config.artefacts.as_ref(), &copy).await?;
         let proven = found.prove(&copy, keys)?;
         let differences = Reported::read(&link, found.id).await?.differences(&run_overview(&copy)?);

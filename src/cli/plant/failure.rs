@@ -43,6 +43,7 @@ impl PlantFailure {
                 if matches!(
                     **error,
                     PlantError::Differs { .. }
+                        | PlantError::UnsafeName { .. }
                         | PlantError::Journal(JournalError::Broken { .. } | JournalError::NoAuthor { .. })
                 ) =>
             {

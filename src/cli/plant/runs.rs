@@ -41,7 +41,8 @@ folder.
 Example:
   regrind plant fetch freeform-mirror-20260704T120000Z --plant planner.toml --out runs
 
-Exit codes: 0 fetched and verified; 1 the run is invalid or incomplete; 2 no such run; 3 the plant cannot be reached.")]
+Exit codes: 0 fetched and verified; 1 the run is invalid or incomplete, or a name on its record can lead to another
+folder; 2 no such run; 3 the plant cannot be reached.")]
 pub(super) struct ToFetch {
     /// Name of the run
     #[arg(value_name = "RUN")]
@@ -102,7 +103,7 @@ pub(super) fn fetch(arguments: &ToFetch) -> Result<Outcome, Failure> {
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
         let run = PlantRun::find(&link, arguments.cell.as_deref(), &arguments.run).await?;
-        let folder = arguments.out.join(&run.name);
+        let folder = run.folder_in(&arguments.out)?;
         run.fetch(&link, config.artefacts.as_ref(), &folder).await?;
         let proven = run.prove(&folder, &[])?;
         let files = super::super::words::counted(proven.artefacts as usize, "file");

@@ -3,6 +3,8 @@
 mod archive;
 mod backup;
 mod book;
+mod fetch;
+mod forged;
 mod knowledge;
 mod layout;
 mod limits;
