@@ -9,6 +9,7 @@ use clap::Args;
 use data_encoding::HEXLOWER;
 use regrind::cell::{Actor, CellPlan, Ending, FirstStep, TABLE_VERSION};
 use regrind::config::{BUILT_IN_CELL, CellConfig};
+use regrind::document::visible;
 use regrind::drive::Task;
 use regrind::formats::run_files::{CycleFolder, RunFile};
 use regrind::formats::{KnowledgeOrigin, Learned, LearnedError, SettingIdentity};
@@ -174,7 +175,8 @@ async fn carry_out(
     let live = RunContext { recipe, cell, part: &part, folder: &folder, job, actor, json: arguments.json };
     let machines = live.open(job)?;
     if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {
-        super::print(&earlier.in_words(&arguments.runs))?;
+        // The names of other cells and their runs come from the plant.
+        super::print(&visible(&earlier.in_words(&arguments.runs)))?;
     }
     // The machines are locked, and nothing was sent to them. From here on the part belongs to this run.
     arguments.plant.begin_part(&folder).await?;

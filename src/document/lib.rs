@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 pub use read::Document;
 pub use read::{problem_at, read_text, sha256};
 pub use schema::schema_of;
-pub use shown::{countable, misleading, visible};
+pub use shown::{countable, misleading, visible, visible_line};
 
 /// Key that has a new name. Both names are paths from the root of the file, without indices.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -22,8 +22,18 @@ fn is_misleading(c: char) -> bool {
 /// Returns a text in which each invisible or misleading character ([`misleading`]) is replaced by its code, such as
 /// `<U+202E>`. Line feeds and tabs stay unchanged.
 pub fn visible(text: &str) -> String {
+    shown(text, |c| matches!(c, '\n' | '\t'))
+}
+
+/// Returns a text as [`visible`] does, with line feeds and tabs replaced too. Use it for a field of a line, so that a text
+/// from elsewhere cannot look like a further line or column.
+pub fn visible_line(text: &str) -> String {
+    shown(text, |_| false)
+}
+
+fn shown(text: &str, stays: impl Fn(char) -> bool) -> String {
     text.chars().fold(String::with_capacity(text.len()), |mut shown, c| {
-        if is_misleading(c) && !matches!(c, '\n' | '\t') {
+        if is_misleading(c) && !stays(c) {
             let _ = write!(shown, "<U+{:04X}>", u32::from(c));
         } else {
             shown.push(c);
@@ -94,5 +104,6 @@ mod tests {
             assert_eq!(misleading(text), found, "{text:?}");
         }
         assert_eq!(visible("a\u{202e}b\n\tc\u{7}"), "a<U+202E>b\n\tc<U+0007>");
+        assert_eq!(visible_line("a\u{9b}b\n\tc"), "a<U+009B>b<U+000A><U+0009>c");
     }
 }

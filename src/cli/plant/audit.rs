@@ -4,6 +4,7 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use regrind::document::visible_line;
 use regrind::formats::ScratchFolder;
 use regrind::journal::PublicKey;
 use regrind_plant::{PlantError, PlantRun, Reported, run_overview};
@@ -94,14 +95,14 @@ fn prove(plant: &Path, run: Option<&Path>, keys: &[PublicKey], json: bool) -> Re
         } else if !json {
             let signed = match proven.signed {
                 0 => "not signed".to_owned(),
-                signed => format!("signatures up to record {signed}, with a key that is enrolled for {}", found.cell),
+                signed => format!("signatures up to record {signed}, with a key that is enrolled for {}", visible_line(&found.cell)),
             };
             let signed = if found.keys.is_empty() && proven.signed > 0 { "signed with a key that is not enrolled at the plant".to_owned() } else { signed };
             super::super::print(&format!(
                 "plant       {} records and {} files of {}, {signed}{}\n",
                 proven.records,
                 proven.artefacts,
-                found.cell,
+                visible_line(&found.cell),
                 if folder.is_some() { "; the local journal contains these records" } else { "" }
             ))?;
         }

@@ -4,6 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use regrind::compensation::MachineSimilarity;
+use regrind::document::visible_line;
 use regrind::drive::Task;
 use regrind::formats::Learned;
 use regrind_plant::Knowledge;
@@ -52,7 +53,7 @@ pub(super) fn query_knowledge(
     let late = |_| Err(format!("no answer within {} s", PATIENCE.as_secs()));
     match answer.recv_timeout(PATIENCE).unwrap_or_else(late) {
         Ok((knowledge, alike)) => {
-            messages.extend(knowledge.skipped);
+            messages.extend(knowledge.skipped.iter().map(|words| visible_line(words)));
             Ok(task.learned_from_others(&knowledge.results, &alike))
         }
         Err(reason) => {

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use regrind::config::PlantConfig;
+use regrind::document::visible_line;
 use regrind_live::{CellStatus, RunStatus};
 use regrind_plant::{DatabaseLink, PlantError, ReplicationResult, Replicator};
 use serde_json::json;
@@ -174,8 +175,7 @@ impl Replication<'_> {
     fn print_round(&mut self, shipped: &ReplicationResult) -> Result<(), Failure> {
         self.waits = false;
         for (run, what) in &shipped.differ {
-            let words = format!("{run}: {what}");
-            eprintln!("ship: {}", regrind::document::visible(&words));
+            eprintln!("ship: {}: {}", visible_line(run), visible_line(what));
         }
         if shipped.records == 0 && shipped.files == 0 {
             return Ok(());

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use regrind::document::visible_line;
 use regrind_plant::PlantRun;
 use serde_json::json;
 
@@ -89,7 +90,8 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
             });
             super::super::print_json(&told.collect::<Vec<_>>())?;
         } else {
-            let line = |([cell, run, serial, result, began], records): ([String; 5], i32)| {
+            let line = |(row, records): ([String; 5], i32)| {
+                let [cell, run, serial, result, began] = row.map(|field| visible_line(&field));
                 format!("{began}  {cell:<16}  {serial:<16}  {result:<12}  {records:>6} records  {run}\n")
             };
             super::super::print(&told.map(line).collect::<String>())?;
@@ -109,9 +111,9 @@ pub(super) fn fetch(arguments: &ToFetch) -> Result<Outcome, Failure> {
         let files = super::super::words::counted(proven.artefacts as usize, "file");
         super::super::print(&format!(
             "{}: {} records of {}, {files}; verified\n",
-            folder.display(),
+            visible_line(&folder.display().to_string()),
             run.records,
-            run.cell
+            visible_line(&run.cell)
         ))?;
         Ok(Outcome::Accepted)
     })
@@ -131,8 +133,11 @@ pub(super) fn incidents(arguments: &ToListIncidents) -> Result<Outcome, Failure>
             });
             super::super::print_json(&told.collect::<Vec<_>>())?;
         } else {
-            let line = |[at, by, run, what, words]: [String; 5]| format!("{at}  {by:<16}  {what}: {words}  {run}\n");
-            super::super::print(&regrind::document::visible(&told.map(line).collect::<String>()))?;
+            let line = |row: [String; 5]| {
+                let [at, by, run, what, words] = row.map(|field| visible_line(&field));
+                format!("{at}  {by:<16}  {what}: {words}  {run}\n")
+            };
+            super::super::print(&told.map(line).collect::<String>())?;
         }
         Ok(Outcome::Accepted)
     })

@@ -1,9 +1,11 @@
-//! Runs that are fetched from the plant: whatever names a cell has sent, nothing is written outside of the folder.
+//! Runs that are fetched from the plant, and lists of what it has: whatever names and texts a cell has sent, nothing is
+//! written outside of the folder, and nothing is sent to the terminal that changes it.
 
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use serde_json::Value;
 use tempfile::TempDir;
 
 use super::forged::Forged;
@@ -87,4 +89,35 @@ fn fetch_refuses_names_that_lead_elsewhere() {
     std::os::unix::fs::symlink(elsewhere.path(), plant.path("back").join(other)).unwrap();
     fetch(other, 2);
     assert_eq!(below(elsewhere.path()), BTreeSet::new());
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn lists_send_no_escape_codes_to_terminal() {
+    let plant = Plant::new();
+    plant.cell("cell-1", &[]);
+    plant.somebody("office", "reader");
+    let harm = "x\u{1b}]0;owned\u{7}\u{9b}31m\u{202e}\r\n2026-01-01  forged line\t";
+    let run = format!("run {}", harm.replace('\r', ""));
+    assert_eq!(Forged { part: harm, ..Forged::named(&run) }.ship(&plant, "cell-1"), Ok(String::new()));
+    plant
+        .asked_by(
+            "cell-1",
+            &format!(
+                "SELECT tell_run(1, '{{\"cycles\": []}}'); SELECT complain($a${run}$a$, $a${harm}$a$, $a${harm}$a$)"
+            ),
+        )
+        .unwrap();
+    let is_clean =
+        |text: &str| text.chars().all(|c| c == '\n' || regrind::document::misleading(&c.to_string()).is_none());
+    for (command, key) in [("runs", "run"), ("incidents", "words")] {
+        let text = plant.does(&["plant", command, "--plant", "office.toml"]);
+        assert!(is_clean(&text) && text.lines().count() == 1, "{command}: {text:?}");
+        let json = plant.does(&["plant", command, "--json", "--plant", "office.toml"]);
+        assert!(is_clean(&json), "{command}: {json:?}");
+        let told: Vec<Value> = serde_json::from_str(&json).unwrap();
+        assert_eq!(told[0][key], if key == "run" { &*run } else { harm }, "the same value as JSON");
+    }
+    let (out, errors) = plant.ends(&["plant", "fetch", &run, "--plant", "office.toml", "--out", "back"], 1);
+    assert!(is_clean(&out) && is_clean(&errors), "{out:?} {errors:?}");
 }
