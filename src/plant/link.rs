@@ -2,13 +2,15 @@
 
 use std::time::Duration;
 
+use regrind_document::visible_line;
+use regrind_trust::{CertificateFault, certificate_fault};
 use serde_json::Value;
 use tokio_postgres::config::SslMode;
 use tokio_postgres::types::ToSql;
 use tokio_postgres::{Client, Config, NoTls, Row};
 use tokio_postgres_rustls::MakeRustlsConnect;
 
-use super::error::{PlantError, in_words, refused};
+use super::error::{PlantError, in_words, passing, refused};
 use super::settings::DatabaseSettings;
 
 /// Timeouts to connect to the database, and to get an answer.
@@ -94,19 +96,30 @@ impl DatabaseLink {
 }
 
 /// Converts `error`, an error of the connection to the database, into a [`PlantError`]. A wrong password or user name
-/// and a missing database become [`PlantError::Refused`]. Every other error becomes [`PlantError::Unreachable`] with
-/// the address `place`.
+/// and a missing database become [`PlantError::Refused`], and a certificate that proves nothing becomes
+/// [`PlantError::Certificate`]. A server that tells of a limit or a fault becomes [`PlantError::DatabaseFault`]. Every
+/// other error becomes [`PlantError::Unreachable`] with the address `place`.
 fn unopened(place: &str, error: &tokio_postgres::Error) -> PlantError {
+    if let Some(CertificateFault { what, remedy }) = certificate_fault(error) {
+        return PlantError::Certificate { place: place.to_owned(), what, remedy };
+    }
+    if in_words(error).contains("does not support TLS") {
+        let remedy = "give the server a certificate (`ssl = on`), as docs/plant.md makes it";
+        return PlantError::Certificate { place: place.to_owned(), what: "it has no certificate".to_owned(), remedy };
+    }
     match error.as_db_error() {
         // Classes 28 (invalid authorisation), 3D and 42 (no such database or role).
         Some(said) if ["28", "3D", "42"].iter().any(|class| said.code().code().starts_with(class)) => {
             PlantError::Refused {
                 what: "the login of this computer",
-                reason: said.message().to_owned(),
+                reason: visible_line(said.message()),
                 hint: "; check name, user and password of [database]".into(),
             }
         }
-        _ => PlantError::Unreachable { place: place.to_owned(), what: in_words(error) },
+        said => {
+            let passing = said.and_then(|said| passing(place, said.code().code(), said.message()));
+            passing.unwrap_or_else(|| PlantError::Unreachable { place: place.to_owned(), what: in_words(error) })
+        }
     }
 }
 

@@ -271,8 +271,9 @@ fn put_aside(folder: &Path, sha256: &[u8], content: &[u8]) -> Result<(), PlantEr
         return Ok(());
     }
     let parent = folder.join(&name[..2]);
-    ResultFolder::prepare(&parent)?.keep();
-    Ok(write_atomic(&path, content)?)
+    let failed = |error| PlantError::folder(folder, error);
+    ResultFolder::prepare(&parent).map_err(failed)?.keep();
+    write_atomic(&path, content).map_err(failed)
 }
 
 async fn open_run(link: &DatabaseLink, name: &str) -> Result<PlantRunState, PlantError> {

@@ -3,6 +3,7 @@
 //! A server on another computer proves its identity with certificates. A client signs in to it with a password that no
 //! other user can read.
 
+use std::error::Error;
 use std::fs::File;
 use std::io::{self, Read};
 use std::net::IpAddr;
@@ -13,7 +14,7 @@ use regrind_formats::{OpenToOthers, readable_by_others};
 use rustls::crypto::ring;
 use rustls::pki_types::CertificateDer;
 use rustls::pki_types::pem::PemObject;
-use rustls::{ClientConfig, RootCertStore};
+use rustls::{CertificateError, ClientConfig, RootCertStore};
 use thiserror::Error;
 
 /// Maximum length of a password file, in bytes.
@@ -59,6 +60,48 @@ pub fn tls_config(
         }
         None if is_here => Ok(None),
         None => Err(TrustError::Unproven { host: host.to_owned(), table }),
+    }
+}
+
+/// Reason why the certificate of a server was refused. No retry helps: a person must change something.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CertificateFault {
+    /// Reason in words.
+    pub what: String,
+    /// Remedy in words.
+    pub remedy: &'static str,
+}
+
+/// Returns the reason why the certificate of a server was refused, if `error` or one of its causes tells that.
+pub fn certificate_fault(error: &(dyn Error + 'static)) -> Option<CertificateFault> {
+    let mut cause = Some(error);
+    while let Some(error) = cause {
+        // The source of an error of input or output is the source of what it contains, and not what it contains.
+        let inner = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
+        let of_inner = || inner.and_then(|inner| inner.downcast_ref::<rustls::Error>());
+        if let Some(rustls::Error::InvalidCertificate(reason)) = error.downcast_ref().or_else(of_inner) {
+            return Some(CertificateFault { what: reason.to_string(), remedy: certificate_remedy(reason) });
+        }
+        cause = inner.map_or_else(|| error.source(), |inner| Some(inner));
+    }
+    None
+}
+
+fn certificate_remedy(reason: &CertificateError) -> &'static str {
+    match reason {
+        CertificateError::Expired
+        | CertificateError::ExpiredContext { .. }
+        | CertificateError::NotValidYet
+        | CertificateError::NotValidYetContext { .. } => {
+            "check the clock of this computer; if it is right, give the server a new certificate"
+        }
+        CertificateError::NotValidForName | CertificateError::NotValidForNameContext { .. } => {
+            "write a name of the server that its certificate contains, or give the server a certificate with this name"
+        }
+        CertificateError::UnknownIssuer | CertificateError::BadSignature => {
+            "put the certificate of the server, or of its issuer, into the file that the key `certificates` names"
+        }
+        _ => "give the server a new certificate, as docs/plant.md makes it",
     }
 }
 
@@ -131,6 +174,24 @@ mod tests {
                 );
             }
         }
+    }
+
+    #[test]
+    fn certificate_fault_is_found_behind_other_errors() {
+        let fault = |reason| rustls::Error::InvalidCertificate(reason);
+        let plain = certificate_fault(&fault(CertificateError::Expired)).unwrap();
+        let wrapped = io::Error::new(io::ErrorKind::InvalidData, fault(CertificateError::Expired));
+        assert_eq!(certificate_fault(&io::Error::other(wrapped)), Some(plain.clone()));
+        assert!(plain.remedy.contains("clock"), "{plain:?}");
+        let others = [CertificateError::UnknownIssuer, CertificateError::NotValidForName].map(|reason| {
+            let found = certificate_fault(&io::Error::other(fault(reason))).unwrap();
+            assert_ne!(found.remedy, plain.remedy);
+            found.remedy
+        });
+        assert_ne!(others[0], others[1]);
+        assert_eq!(certificate_fault(&io::Error::other("reset")), None);
+        assert_eq!(certificate_fault(&io::Error::from(io::ErrorKind::TimedOut)), None);
+        assert_eq!(certificate_fault(&rustls::Error::DecryptError), None);
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! `regrind ship`: replicates the records of this cell to the plant, in parallel with the work of the cell.
 
 use std::io::{self, Read};
+use std::mem::{Discriminant, discriminant};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -64,7 +65,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         link: None,
         arguments,
         monitor: None,
-        waits: false,
+        waits_for: None,
     };
     super::super::runtime()?.block_on(async {
         if arguments.once {
@@ -87,8 +88,8 @@ struct Replication<'a> {
     arguments: &'a Arguments,
     /// Monitor of the status of the cell. `None` before the first round, and while the status is read.
     monitor: Option<CellMonitor>,
-    /// True if the message about an unreachable plant was printed.
-    waits: bool,
+    /// Kind of the last error that was printed and that a retry can solve; `None` since a round succeeded.
+    waits_for: Option<Discriminant<PlantError>>,
 }
 
 impl Replication<'_> {
@@ -117,8 +118,8 @@ impl Replication<'_> {
                     wait = ROUND;
                     Some(shipped)
                 }
-                Err(Failure::Plant(error)) if error.may_pass() => {
-                    self.waits_for(&error)?;
+                Err(Failure::Plant(PlantFailure::Plant(error))) if error.may_pass() => {
+                    self.print_waiting(&error);
                     wait = (2 * wait).min(LONGEST_WAIT);
                     None
                 }
@@ -173,7 +174,7 @@ impl Replication<'_> {
     }
 
     fn print_round(&mut self, shipped: &ReplicationResult) -> Result<(), Failure> {
-        self.waits = false;
+        self.waits_for = None;
         for (run, what) in &shipped.differ {
             eprintln!("ship: {}: {}", visible_line(run), visible_line(what));
         }
@@ -190,15 +191,13 @@ impl Replication<'_> {
         super::super::print(&format!("shipped {records} records and {files} files of {runs} runs\n"))
     }
 
-    /// Prints `error`, which states why the plant cannot be reached. Prints nothing if such an error was printed since
-    /// the last successful round.
-    fn waits_for(&mut self, error: &PlantFailure) -> Result<(), Failure> {
-        if !std::mem::replace(&mut self.waits, true) {
-            eprintln!(
-                "ship: {error}; the cell continues, and its records stay on this computer until the plant can be reached"
-            );
+    /// Prints `error`, which states why the plant takes no records now. Prints nothing if an error of this kind was the
+    /// last one that was printed since the last successful round.
+    fn print_waiting(&mut self, error: &PlantError) {
+        if self.waits_for.replace(discriminant(error)) != Some(discriminant(error)) {
+            let words = visible_line(&error.to_string());
+            eprintln!("ship: {words}; the cell continues, and its records stay on this computer until then");
         }
-        Ok(())
     }
 }
 

@@ -3,6 +3,7 @@
 mod archive;
 mod backup;
 mod book;
+mod faults;
 mod fetch;
 mod forged;
 mod knowledge;
