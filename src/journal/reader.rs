@@ -51,6 +51,23 @@ impl Reader {
         }
     }
 
+    /// Checks that each record follows the one before it by its number and hash, and has the content that was hashed. Does
+    /// not check signatures, files and anchors: [`super::verify()`] does this.
+    ///
+    /// # Errors
+    /// [`JournalError::Broken`] for the first record that does not. The journal cannot be read.
+    pub fn check_chain(&self) -> Result<(), JournalError> {
+        let mut head = "0".repeat(64);
+        for (record, before) in self.records(1).zip(0..) {
+            let record = record?;
+            if let Some(what) = record.successor_flaw(before, &head) {
+                return Err(JournalError::Broken { path: self.folder.clone(), seq: before + 1, what });
+            }
+            head = record.hash;
+        }
+        Ok(())
+    }
+
     /// Returns the lowest record number that is less than 1, or `None` if no record has such a number. The journal
     /// numbers its records from 1, so a lower number proves that somebody changed the database.
     pub(super) fn number_before_the_first(&self) -> Result<Option<i64>, JournalError> {
@@ -79,6 +96,12 @@ pub struct Stamp {
 }
 
 impl Stamp {
+    /// Returns true if the files have the same times and lengths as those of `other`. Soon after a change this does not
+    /// show that no record was added.
+    pub fn has_same_files(&self, other: &Self) -> bool {
+        self.files == other.files
+    }
+
     /// Returns the time of the last change; `None` if there are no files.
     pub fn changed_at(&self) -> Option<SystemTime> {
         self.files.iter().flatten().map(|(at, _)| *at).max()
@@ -121,12 +144,14 @@ mod tests {
         let at = |seconds: u64| stamp_at(home.path(), changed + Duration::from_secs(seconds));
         for (a, b, is_same) in [(0, 0, false), (1, 60, false), (60, 70, true)] {
             assert_eq!(at(a) == at(b), is_same, "{a} s and {b} s after the change");
+            assert!(at(a).has_same_files(&at(b)));
         }
         // A clock that was set back: the file seems to be from the future.
         assert!(stamp_at(home.path(), changed - Duration::from_secs(60)) != at(60));
         let before = at(60);
         std::fs::write(home.path().join(DATABASE), "longer").unwrap();
         let changed = stamp(home.path()).changed_at().unwrap();
-        assert!(before != stamp_at(home.path(), changed + Duration::from_secs(60)));
+        let after = stamp_at(home.path(), changed + Duration::from_secs(60));
+        assert!(before != after && !before.has_same_files(&after));
     }
 }

@@ -35,6 +35,9 @@ pub enum PlantError {
     Refused { what: &'static str, reason: String, hint: String },
     #[error("the tables of the database have layout {found}, but this program requires layout {known}; {remedy}")]
     Layout { found: i32, known: i32, remedy: &'static str },
+    /// The database does not accept a value of these data, and possibly accepts others.
+    #[error("the database refused {what}: {reason}{hint}")]
+    Value { what: &'static str, reason: String, hint: String },
     #[error(
         "the layout of the database was changed: migration {version} has another text; restore the database from its \
          backup"
@@ -122,7 +125,8 @@ fn is_passing(kind: io::ErrorKind) -> bool {
 
 /// Returns a function that converts an error of the database into a [`PlantError`]. `what` names the request in the
 /// message, if the database refuses it. An error that a retry can solve, for example a restarting server, becomes
-/// [`PlantError::Unreachable`].
+/// [`PlantError::Unreachable`], [`PlantError::DatabaseFull`] or [`PlantError::DatabaseFault`]. A value that the database
+/// does not accept becomes [`PlantError::Value`].
 pub(crate) fn refused(what: &'static str) -> impl Fn(tokio_postgres::Error) -> PlantError {
     move |error| {
         let Some(said) = error.as_db_error() else {
@@ -133,6 +137,10 @@ pub(crate) fn refused(what: &'static str) -> impl Fn(tokio_postgres::Error) -> P
             return passing;
         }
         let hint = said.hint().map_or(String::new(), |hint| format!("; {}", visible_line(hint)));
+        // Classes 22 (a value of the data) and 23 (a rule of a table).
+        if ["22", "23"].iter().any(|class| code.starts_with(class)) {
+            return PlantError::Value { what, reason, hint };
+        }
         PlantError::Refused { what, reason, hint }
     }
 }

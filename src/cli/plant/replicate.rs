@@ -27,16 +27,18 @@ const LINGERS: Duration = Duration::from_secs(30);
 /// Replicate the records and files of finished and running runs to the plant
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The command runs until you stop it. While the plant cannot be reached, the command keeps trying. The plant verifies the
-chain of every record on arrival. If a journal was shortened or changed after its replication, this command and the
-plant report the change. The cell never waits for this command.
+The command runs until you stop it. While the plant cannot be reached, or while its disk is full, the command keeps
+trying. The plant verifies the chain of every record on arrival. If a journal was shortened or changed after its
+replication, or if a recorded file is missing or was changed, this command and the plant report it. Runs that are whole
+at the plant are not read again. The cell never waits for this command.
 
 Examples:
   regrind ship --plant plant.toml
   regrind ship --plant plant.toml --runs /srv/runs --once
 
-Exit codes: 0 stopped by Ctrl-C, or everything has arrived; 1 a run differs from its copy at the plant; 2 bad arguments;
-3 with --once, the plant cannot be reached.")]
+Exit codes: 0 stopped by Ctrl-C, or everything has arrived; 1 a run differs from its copy at the plant, a recorded file
+is missing or was changed, or a journal cannot be read; 2 bad arguments, or the database does not prove its identity;
+3 with --once, the plant cannot be reached or its disk is full.")]
 pub(in crate::cli) struct Arguments {
     /// Plant file: address and user of the database
     #[arg(long, value_name = "FILE")]
@@ -98,10 +100,11 @@ impl Replication<'_> {
         self.ended()
     }
 
-    /// Returns the outcome of the command: `NotInTolerance` if a run differs from its copy at the plant, otherwise
-    /// `Accepted`.
+    /// Returns the outcome of the command: `NotInTolerance` if a run differs from its copy at the plant, or if the plant
+    /// lacks something that cannot be sent. Otherwise `Accepted`.
     fn ended(&self) -> Result<Outcome, Failure> {
-        Ok(if self.shipper.skipped().next().is_some() { Outcome::NotInTolerance } else { Outcome::Accepted })
+        let is_whole = self.shipper.skipped().chain(self.shipper.lacking()).next().is_none();
+        Ok(if is_whole { Outcome::Accepted } else { Outcome::NotInTolerance })
     }
 
     /// Replicates records to the plant, one round after the other. If the plant cannot be reached, waits before the
@@ -147,6 +150,7 @@ impl Replication<'_> {
     async fn round(&mut self) -> Result<ReplicationResult, Failure> {
         if self.link.as_ref().is_none_or(DatabaseLink::is_closed) {
             self.link = Some(open(&self.config).await?);
+            self.shipper.reconnected();
         }
         let Some(link) = &self.link else { return Ok(ReplicationResult::default()) };
         let shipped = self.shipper.round(link).await;

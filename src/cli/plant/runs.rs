@@ -14,6 +14,8 @@ use super::plant_file::{Where, open};
 /// List the newest runs of all cells, or those of one part
 #[derive(Args, Debug)]
 #[command(after_help = "\
+A run whose time is in the future, by a wrong clock of its cell, comes last.
+
 Examples:
   regrind plant runs --plant planner.toml
   regrind plant runs --part SN-00 --plant planner.toml
@@ -80,8 +82,14 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
-        let text = "SELECT cell, run, serial, coalesce(result, 'open'), coalesce(to_char(began, 'YYYY-MM-DD HH24:MI:SS'), ''), records
-            FROM part_run WHERE $1::text IS NULL OR starts_with(serial, $1) ORDER BY began DESC LIMIT $2";
+        // Each part is found by the index of the times. A run of the far future must not hide the others.
+        let text = "SELECT cell, run, serial, coalesce(result, 'open'), coalesce(to_char(began, 'YYYY-MM-DD HH24:MI:SS'), ''), records FROM (
+            (SELECT 1 AS place, * FROM part_run WHERE began < now() + interval '1 day' AND ($1::text IS NULL OR starts_with(serial, $1))
+                ORDER BY began DESC LIMIT $2)
+            UNION ALL
+            (SELECT 2, * FROM part_run WHERE began >= now() + interval '1 day' AND ($1::text IS NULL OR starts_with(serial, $1))
+                ORDER BY began DESC LIMIT $2)
+            ) AS both_of ORDER BY place, began DESC LIMIT $2";
         let found = link.query(text, &[&arguments.part, &i64::from(arguments.max_rows)]).await?;
         let told = found.iter().map(|row| ([0, 1, 2, 3, 4].map(|k| row.get::<_, String>(k)), row.get::<_, i32>(5)));
         if arguments.json {

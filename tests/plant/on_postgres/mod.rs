@@ -12,6 +12,7 @@ mod limits;
 mod page;
 mod records;
 mod rights;
+mod shipping;
 mod studies;
 mod weather;
 mod work;
