@@ -4,23 +4,30 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::document::visible_line;
-use regrind_plant::PlantRun;
+use regrind_plant::{PlantRun, RunGap};
 use serde_json::json;
 
 use super::super::Outcome;
 use super::super::failure::Failure;
 use super::plant_file::{Where, open};
 
-/// List the newest runs of all cells, or those of one part
+/// List the newest runs of all cells, or those of one part, or the runs that never arrived
 #[derive(Args, Debug)]
 #[command(after_help = "\
 A run whose time is in the future, by a wrong clock of its cell, comes last.
 
+The first record of each run has the number of the run in its folder, and names the run before it. With --missing, the
+command lists the numbers that the plant has not got, with the runs at the plant before and after them. A run that a
+cell has not shipped yet is missing too: first ship the runs of the cell with `regrind ship --once`. The newest runs of
+a cell are not missed, because no later run names them.
+
 Examples:
   regrind plant runs --plant planner.toml
   regrind plant runs --part SN-00 --plant planner.toml
+  regrind plant runs --missing --plant planner.toml
 
-Exit codes: 0 listed; 2 the database refuses the command; 3 the database cannot be reached.")]
+Exit codes: 0 listed, with --missing: no run is missing; 1 with --missing: runs are missing; 2 the database refuses the
+command; 3 the database cannot be reached.")]
 pub(super) struct ToList {
     /// Serial number of the part, or its first characters
     #[arg(long, value_name = "SERIAL")]
@@ -28,6 +35,9 @@ pub(super) struct ToList {
     /// Maximum number of entries
     #[arg(long, alias = "most", value_name = "N", default_value_t = 40)]
     max_rows: u32,
+    /// List the runs that never arrived, by the gaps in the numbers of the runs of each cell
+    #[arg(long, conflicts_with_all = ["part", "max_rows"])]
+    missing: bool,
     #[command(flatten)]
     plant: Where,
     /// Print JSON instead of text
@@ -82,6 +92,9 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
+        if arguments.missing {
+            return print_gaps(&RunGap::all(&link).await?, arguments.json);
+        }
         // Each part is found by the index of the times. A run of the far future must not hide the others.
         let text = "SELECT cell, run, serial, coalesce(result, 'open'), coalesce(to_char(began, 'YYYY-MM-DD HH24:MI:SS'), ''), records FROM (
             (SELECT 1 AS place, * FROM part_run WHERE began < now() + interval '1 day' AND ($1::text IS NULL OR starts_with(serial, $1))
@@ -106,6 +119,34 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
         }
         Ok(Outcome::Accepted)
     })
+}
+
+/// Prints the numbers of runs that the plant has not got. Returns `NotInTolerance` if there are any.
+fn print_gaps(gaps: &[RunGap], json: bool) -> Result<Outcome, Failure> {
+    if json {
+        let told = gaps.iter().map(|RunGap { cell, numbers: [first, last], after, before, named }| {
+            let (named, records) = named.as_ref().map(|(run, records)| (run, records)).unzip();
+            json!({ "cell": cell, "first": first, "last": last, "after": after, "before": before, "named": named, "records": records })
+        });
+        super::super::print_json(&told.collect::<Vec<_>>())?;
+    } else {
+        let line = |gap: &RunGap| {
+            let RunGap { cell, numbers: [first, last], after, before, named } = gap;
+            let numbers =
+                if first == last { format!("number {first} is") } else { format!("numbers {first} to {last} are") };
+            let after = after.as_ref().map_or("the beginning".to_owned(), |run| visible_line(run));
+            let named = named.as_ref().map_or(String::new(), |(run, records)| {
+                format!("; the last missing run is {} with at least {records} records", visible_line(run))
+            });
+            format!(
+                "{:<16}  {numbers} missing between {after} and {}{named}\n",
+                visible_line(cell),
+                visible_line(before)
+            )
+        };
+        super::super::print(&gaps.iter().map(line).collect::<String>())?;
+    }
+    Ok(if gaps.is_empty() { Outcome::Accepted } else { Outcome::NotInTolerance })
 }
 
 pub(super) fn fetch(arguments: &ToFetch) -> Result<Outcome, Failure> {

@@ -217,6 +217,52 @@ fn record_rewritten_while_shipping_is_found() {
     assert_eq!(plant.sql("SELECT run FROM incident WHERE what = 'a journal that differs'"), "run-1");
 }
 
+/// Content of a first record with a number and the run before it.
+fn place(number: u64, before: Option<&str>) -> Value {
+    let before = before.map(|run| json!({ "run": run, "records": 7, "head": "ab".repeat(32) }));
+    json!({ "recover": true, "cell": "sim", "number": number, "before": before })
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn runs_that_never_came_are_listed() {
+    let plant = Plant::new();
+    for cell in ["cell-1", "cell-2"] {
+        plant.cell(cell, &[]);
+    }
+    plant.somebody("office", "reader");
+    let ship = |cell: &str, name: &str, content: Value| {
+        assert_eq!(Forged { content, ..Forged::named(name) }.ship(&plant, cell), Ok(String::new()), "{name}");
+    };
+    let missing = ["plant", "runs", "--missing", "--plant", "office.toml"];
+    ship("cell-1", "old", json!({ "recover": true, "cell": "sim" }));
+    ship("cell-1", "a1", place(1, None));
+    ship("cell-1", "a2", place(2, Some("a1")));
+    // Another folder of the same cell, and the first one after it was restored from its backup.
+    ship("cell-1", "b1", place(1, None));
+    ship("cell-1", "b2", place(2, Some("b1")));
+    ship("cell-1", "a2-restored", place(2, Some("a1")));
+    plant.does(&missing);
+    ship("cell-1", "a5", place(5, Some("a4")));
+    ship("cell-2", "c2", place(2, Some("c1")));
+    let lists = |with: &[&str], code| {
+        let (out, _) = plant.ends(&[&missing[..], with].concat(), code);
+        serde_json::from_str::<Value>(&out).unwrap()
+    };
+    let found = lists(&["--json"], 1);
+    let gap = |cell: &str, numbers: [u64; 2], before: Value, after: &str, named: &str| json!({ "cell": cell, "first": numbers[0], "last": numbers[1], "after": before, "before": after, "named": named, "records": 7 });
+    let [one, two] =
+        [gap("cell-1", [3, 4], found[0]["after"].clone(), "a5", "a4"), gap("cell-2", [1, 1], Value::Null, "c2", "c1")];
+    assert_eq!(found, json!([one, two]));
+    assert!(["a2", "b2", "a2-restored"].contains(&found[0]["after"].as_str().unwrap()), "{found}");
+    ship("cell-2", "c1", place(1, None));
+    ship("cell-1", "a4", place(4, Some("a3")));
+    ship("cell-1", "a3", place(3, Some("a2")));
+    plant.does(&missing);
+    // A person at a cell sees the runs of this cell alone.
+    plant.does(&["plant", "runs", "--missing", "--plant", "cell-2.toml"]);
+}
+
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
 fn records_of_shipped_run_are_those_of_the_cell() {
