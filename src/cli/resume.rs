@@ -22,7 +22,7 @@ use regrind::setup;
 use super::failure::Failure;
 use super::live::{PreparedRun, RunContext, outcome};
 use super::run::{epoch, operator, within};
-use super::{Outcome, check, control, key};
+use super::{Outcome, check, control, key, plant};
 
 /// Resume a held cell, or a run whose program has ended
 #[derive(Args, Debug)]
@@ -58,6 +58,8 @@ pub(super) struct Arguments {
     /// a job that the record does not know
     #[arg(long)]
     despite_loss: bool,
+    #[command(flatten)]
+    plant: plant::ResumeArguments,
     /// Print the answer, or a line for each event, as JSON
     #[arg(long)]
     json: bool,
@@ -81,6 +83,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 /// other decisions. Also returns an error if the machines were simulated inside the program that was interrupted.
 fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     let key = key::of_this_user()?;
+    let plant_file = arguments.plant.plant_file();
     // From here on, another program that resumes or verifies the run finds it driven.
     let lock = RunLock::acquire(folder).map_err(Failure::Journal)?;
     let begun = RunStart::read(folder, arguments.despite_loss)?;
@@ -102,6 +105,8 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
             "{marked}interrupted in {state}\nthe record is complete, and a replay of the record gives the same results\n"
         ))?;
     }
+    // A part of the queue stays with its run: the plant learns of its end from the record.
+    let _plant = plant::start_processes(folder.parent().unwrap_or(folder), plant_file.as_deref())?;
     super::runtime()?.block_on(async {
         let (part, actor) = (&begun.part_in_files, operator(arguments.operator.as_deref()));
         let (recipe, cell, json) = (&recipe, &cell, arguments.json);

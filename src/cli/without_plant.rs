@@ -3,7 +3,7 @@
 
 use std::convert::Infallible;
 use std::ops::ControlFlow;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use regrind::config::CellConfig;
@@ -52,6 +52,22 @@ impl RunArguments {
     pub(super) fn write_truth(&self, _: &World, _: &Recipe, _: &CellConfig) -> Result<(), Failure> {
         Ok(())
     }
+}
+
+/// Arguments of `regrind resume` about the plant: none.
+#[derive(Args, Debug)]
+pub(super) struct ResumeArguments {}
+
+impl ResumeArguments {
+    /// Returns no file.
+    pub(super) fn plant_file(&self) -> Option<PathBuf> {
+        None
+    }
+}
+
+/// Starts no program.
+pub(super) fn start_processes(_: &Path, _: Option<&Path>) -> Result<Option<Infallible>, Failure> {
+    Ok(None)
 }
 
 /// Arguments of `regrind audit verify` about the plant: none.

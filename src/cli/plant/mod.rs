@@ -32,7 +32,7 @@ use super::Outcome;
 use super::failure::Failure;
 pub(super) use audit::AuditArguments;
 pub(super) use failure::PlantFailure;
-pub(super) use run_arguments::RunArguments;
+pub(super) use run_arguments::{ResumeArguments, RunArguments, start_processes};
 
 /// Commands of a plant.
 #[derive(Debug, Subcommand)]

@@ -29,6 +29,28 @@ pub(in super::super) struct RunArguments {
     pub(super) truth: Option<PathBuf>,
 }
 
+/// Plant of a run that is resumed.
+#[derive(Args, Debug)]
+pub(in super::super) struct ResumeArguments {
+    /// Also replicate the record to the plant of this file, as `regrind run --plant` does, if the run is resumed in this
+    /// terminal
+    #[arg(long, value_name = "FILE")]
+    plant: Option<PathBuf>,
+}
+
+impl ResumeArguments {
+    /// Returns the path of the plant file, independent of the working folder, which the resumed run changes.
+    pub(in super::super) fn plant_file(&self) -> Option<PathBuf> {
+        self.plant.as_ref().map(|plant| std::path::absolute(plant).unwrap_or_else(|_| plant.clone()))
+    }
+}
+
+/// Starts the programs that replicate and publish the runs in the folder `runs`, if there is a plant file. Returns an
+/// error if the plant file is invalid or a process cannot be started.
+pub(in super::super) fn start_processes(runs: &Path, plant: Option<&Path>) -> Result<Option<PlantProcesses>, Failure> {
+    plant.map(|plant| PlantProcesses::start(runs, plant)).transpose()
+}
+
 impl RunArguments {
     /// Returns the results of other cells of the plant from which `task` can start. Returns `None` if no plant is given,
     /// if it has no usable results, or if it does not answer. Adds messages for the operator to `messages`. Returns an
@@ -44,7 +66,7 @@ impl RunArguments {
     /// Starts the programs that replicate and publish the runs in the folder `runs`, if a plant is given. Returns an
     /// error if the plant file is invalid or a process cannot be started.
     pub(in super::super) fn start_processes(&self, runs: &Path) -> Result<Option<PlantProcesses>, Failure> {
-        self.plant.as_ref().map(|plant| PlantProcesses::start(runs, plant)).transpose()
+        start_processes(runs, self.plant.as_deref())
     }
 
     /// Tells the plant that the run in the folder `run` makes the part from its queue, if there is such a part. Returns

@@ -282,6 +282,48 @@ fn is_told(cell: &Cell, broker: &Broker) {
     }
 }
 
+#[test]
+#[ignore = "needs PostgreSQL and mosquitto (Debian packages)"]
+fn resumed_run_is_shipped_while_it_runs() {
+    let plant = Plant::new();
+    fs::create_dir(plant.path("net")).unwrap();
+    let socket = plant.postgres.socket_file();
+    let _network = Network::between(&plant.path("net").join(socket.file_name().unwrap()), socket.clone());
+    plant.somebody("planner", "planner");
+    fs::write(plant.path("small.toml"), recipe()).unwrap();
+    plant.does(&["plant", "propose", "small.toml", "--plant", "planner.toml"]);
+    let approvers = ["Ada", "Bob"].map(|person| approves(&plant, person, "small")).concat();
+    plant.does(&["plant", "queue", "SN-1", "--recipe", "small", "--plant", "planner.toml"]);
+    let broker = Broker::start();
+    let (cell, _machines) = cell(&plant, 1, &approvers, &broker);
+    let none = BTreeSet::new();
+    let mut running = cell.does(&["work", "--cell", "cell.toml", "--json", "--once"]);
+    assert_eq!(follow(&mut running, &|| cell.open_run(&none), 25), None, "killed in the middle");
+    // The programs that ship and tell end with the program that they serve.
+    let began = Instant::now();
+    while plant.sql("SELECT count(*) FROM pg_stat_activity WHERE usename = 'cell_1'") != "0" {
+        assert!(began.elapsed() < PATIENCE, "they do not end");
+        std::thread::park_timeout(Duration::from_millis(50));
+    }
+    let shipped = |plant: &Plant| plant.sql("SELECT records FROM run").parse::<u64>().unwrap();
+    let before = shipped(&plant);
+    let run = cell.open_run(&none).unwrap();
+    let name = run.strip_prefix(&cell.home).unwrap().display().to_string();
+    let mut running = cell.does(&["resume", &name, "--json"]);
+    running.until("records that arrive while the run is on", |_| (shipped(&plant) > before).then_some(()));
+    assert!(!is_over(&run) && !running.is_over());
+    assert_eq!(follow(&mut running, &|| Some(run.clone()), usize::MAX), Some(0));
+    let began = Instant::now();
+    while plant.sql("SELECT state FROM work") != "ended" {
+        assert!(began.elapsed() < PATIENCE, "the end of the part does not arrive");
+        std::thread::park_timeout(Duration::from_millis(50));
+    }
+    let steps =
+        "SELECT count(*) FILTER (WHERE step = 'begun'), count(*) FILTER (WHERE step = 'given back') FROM work_step";
+    assert_eq!(plant.sql(steps), "1|0", "the part stays with its run");
+    assert_eq!(shipped(&plant), Reader::open(&run).unwrap().last().unwrap().unwrap().seq);
+}
+
 /// Returns the number of parts without a finished run, by the records at the cells.
 fn open_parts(plant: &Plant, cells: &[Cell], parts: usize) -> usize {
     let begun: usize = plant.sql("SELECT count(*) FROM work WHERE state IN ('begun', 'ended')").parse().unwrap();
