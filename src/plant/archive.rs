@@ -9,11 +9,11 @@
 //! be proven, stays.
 
 use std::fs;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 
 use data_encoding::HEXLOWER;
 use regrind_formats::{ScratchFolder, move_folder};
-use regrind_journal::{Artefact, Reader, Record, RecordKind};
+use regrind_journal::{Artefact, Reader, Record, RecordKind, is_plain_name};
 use tokio_postgres::Transaction;
 use tokio_postgres::types::ToSql;
 
@@ -115,7 +115,8 @@ async fn archive_run(
     if !run.is_over {
         return Ok(Some("it has not ended, or its last record arrived less than a day ago".into()));
     }
-    let [cell, name] = [&run.cell, &run.name].map(|name| is_file_name(name).then_some(name));
+    let [cell, name] =
+        [&run.cell, &run.name].map(|name| (is_plain_name(name) && !name.starts_with('.')).then_some(name));
     let Some((cell, name)) = cell.zip(name) else {
         return Ok(Some("the name of the cell or of the run cannot be the name of a folder".into()));
     };
@@ -139,13 +140,6 @@ async fn archive_run(
         0 => Ok(Some("records arrived while it was archived; archive it again".into())),
         _ => Ok(None),
     }
-}
-
-/// Returns true if `name` can be the name of a folder below another one: it leads nowhere else, and it is not hidden.
-fn is_file_name(name: &str) -> bool {
-    let mut parts = Path::new(name).components();
-    matches!((parts.next(), parts.next()), (Some(Component::Normal(part)), None) if part == name)
-        && !name.starts_with('.')
 }
 
 /// Brings a run back from its folder in the archive. The folder must prove the run with the keys of its cell, and must
@@ -210,15 +204,4 @@ async fn put_file(
     step.execute(put, &[&sha256, &bytes, &content]).await.map_err(&failed)?;
     let put = "INSERT INTO artefact_of (cell, sha256) VALUES ($1, $2) ON CONFLICT DO NOTHING";
     step.execute(put, &[&cell, &sha256]).await.map(drop).map_err(&failed)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::is_file_name;
-
-    #[test]
-    fn names_that_lead_elsewhere_are_no_folders() {
-        assert!(["run-1", "free form 7", "a.b", "\u{e4}"].iter().all(|name| is_file_name(name)));
-        assert!(["", ".", "..", "a/b", "/a", "a/", "./a", "../a", ".hidden"].iter().all(|name| !is_file_name(name)));
-    }
 }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
+use regrind::document::visible_line;
 use regrind::formats::{PrivateDraft, write_private};
 use regrind::journal::PublicKey;
 use regrind_plant::{NewMember, PlantError, PlantRole, add_cell_keys, enrol_cell, migrate, retire_cell};
@@ -227,7 +228,10 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
             let told = cells.iter().map(|[cell, words, at, run]| json!({ "cell": cell, "words": words, "told_at": at, "run": run }));
             super::super::print_json(&told.collect::<Vec<_>>())?;
         } else {
-            let line = |[cell, words, at, run]: &[String; 4]| format!("{cell:<20}  {at:<19}  {words}  {run}\n");
+            let line = |of: &[String; 4]| {
+                let [cell, words, at, run] = of.each_ref().map(|field| visible_line(field));
+                format!("{cell:<20}  {at:<19}  {words}  {run}\n")
+            };
             super::super::print(&cells.iter().map(line).collect::<String>())?;
         }
         Ok(Outcome::Accepted)

@@ -1,6 +1,7 @@
 //! `regrind plant queue|unqueue|work`: the queue of parts to be made.
 
 use clap::Args;
+use regrind::document::visible_line;
 use regrind_plant::PlantRecipe;
 use serde_json::json;
 
@@ -85,7 +86,8 @@ pub(super) fn queue(arguments: &ToQueue) -> Result<Outcome, Failure> {
         let made = link.query(text, &[&arguments.serials, &sha256, &arguments.cell, &due]).await?;
         let numbers: Vec<i64> = made.iter().map(|row| row.get(0)).collect();
         let lines = numbers.iter().zip(&arguments.serials).map(|(number, serial)| {
-            format!("{number:>6}  {serial}  to be made by version {} of the recipe {}\n", recipe.version, recipe.name)
+            let [serial, name] = [serial, &recipe.name].map(|field| visible_line(field));
+            format!("{number:>6}  {serial}  to be made by version {} of the recipe {name}\n", recipe.version)
         });
         super::super::print(&lines.collect::<String>())?;
         Ok(Outcome::Accepted)
@@ -124,11 +126,12 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
             told.push(json!({
                 "work": id, "serial": serial, "recipe": recipe, "version": version, "due": due, "state": state, "cell": cell, "run": run,
             }));
+            let [serial, recipe, due, cell, run] = [serial, recipe, due, cell, run].map(visible_line);
             lines += &format!("{id:>6}  {serial:<16}  {recipe} {version}  {due:<10}  {state:<6}  {cell}  {run}\n");
         }
         match arguments.json {
             true => super::super::print_json(&told)?,
-            false => super::super::print(&regrind::document::visible(&lines))?,
+            false => super::super::print(&lines)?,
         }
         Ok(Outcome::Accepted)
     })

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 
 use clap::Args;
-use regrind::journal::AuditKey;
+use regrind::journal::{AuditKey, is_plain_path};
 use regrind::recipe::Recipe;
 use regrind_plant::{Approval, PlantError, PlantRecipe};
 use serde_json::json;
@@ -164,7 +164,7 @@ pub(super) fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Fai
 /// Returns true if `path` is a relative path that stays below its start folder, so that no part of the path is `..`.
 /// Returns false for an empty or absolute path.
 pub(super) fn is_below(path: &Path) -> bool {
-    path.components().next().is_some() && path.components().all(|part| matches!(part, Component::Normal(_)))
+    path.components().all(|part| matches!(part, Component::Normal(_))) && path.to_str().is_some_and(is_plain_path)
 }
 
 pub(super) fn approve(arguments: &ToApprove) -> Result<Outcome, Failure> {

@@ -62,7 +62,7 @@ pub(in crate::cli) struct Arguments {
     /// Make at most one part
     #[arg(long)]
     once: bool,
-    /// Wait for further parts when none is left, until Ctrl-C
+    /// Wait for further parts when none is left, or while the plant cannot be reached, until Ctrl-C
     #[arg(long, conflicts_with = "once")]
     wait: bool,
     /// Give back a part that was started here without any result of its run: you have checked that nothing was ground
@@ -87,8 +87,20 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     if let Some(serial) = arguments.give_back.as_ref().or(arguments.give_up.as_ref()) {
         return super::super::runtime()?.block_on(give(&config, &arguments.runs, serial, arguments.reason.as_deref()));
     }
+    let mut is_told = false;
     loop {
-        let (recipe, taken) = match super::super::runtime()?.block_on(next(&config, arguments))? {
+        let next = match super::super::runtime()?.block_on(next(&config, arguments)) {
+            Err(Failure::Plant(error)) if arguments.wait && error.may_pass() => {
+                if !std::mem::replace(&mut is_told, true) {
+                    eprintln!("work: {error}; this cell waits until the plant can be reached");
+                }
+                std::thread::sleep(ROUND);
+                continue;
+            }
+            other => other?,
+        };
+        is_told = false;
+        let (recipe, taken) = match next {
             Next::Part(recipe, taken) => (recipe, taken),
             Next::None if arguments.wait => {
                 std::thread::sleep(ROUND);

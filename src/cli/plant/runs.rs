@@ -172,19 +172,20 @@ pub(super) fn incidents(arguments: &ToListIncidents) -> Result<Outcome, Failure>
     let config = arguments.plant.read()?;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
-        let text = "SELECT to_char(i.at, 'YYYY-MM-DD HH24:MI:SS'), coalesce(c.name, i.role), coalesce(i.run, ''), i.what, i.words
-            FROM incident i LEFT JOIN cell c ON c.id = i.cell ORDER BY i.id DESC LIMIT $1";
+        let text = "SELECT to_char(last_at, 'YYYY-MM-DD HH24:MI:SS'), coalesce(cell, by), coalesce(run, ''), what, words, times
+            FROM incident_told ORDER BY last_at DESC, id DESC LIMIT $1";
         let found = link.query(text, &[&i64::from(arguments.max_rows)]).await?;
-        let told = found.iter().map(|row| [0, 1, 2, 3, 4].map(|k| row.get::<_, String>(k)));
+        let told = found.iter().map(|row| ([0, 1, 2, 3, 4].map(|k| row.get::<_, String>(k)), row.get::<_, i32>(5)));
         if arguments.json {
-            let told = told.map(|[at, by, run, what, words]| {
-                json!({ "at": at, "by": by, "run": run, "what": what, "words": words })
+            let told = told.map(|([at, by, run, what, words], times)| {
+                json!({ "at": at, "by": by, "run": run, "what": what, "words": words, "times": times })
             });
             super::super::print_json(&told.collect::<Vec<_>>())?;
         } else {
-            let line = |row: [String; 5]| {
+            let line = |(row, times): ([String; 5], i32)| {
                 let [at, by, run, what, words] = row.map(|field| visible_line(&field));
-                format!("{at}  {by:<16}  {what}: {words}  {run}\n")
+                let times = if times > 1 { format!("  ({times} times)") } else { String::new() };
+                format!("{at}  {by:<16}  {what}: {words}  {run}{times}\n")
             };
             super::super::print(&told.map(line).collect::<String>())?;
         }

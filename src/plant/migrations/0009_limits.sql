@@ -30,13 +30,14 @@ BEGIN
     RETURN FOUND;
 END $$;
 
--- What each cell has sent on a day.
+-- What each cell has sent on a day, a row for each connection: no connection waits for another one, which could be a deadlock.
 CREATE TABLE cell_usage (
     cell integer NOT NULL REFERENCES cell,
     day date NOT NULL,
+    connection integer NOT NULL DEFAULT pg_backend_pid(),
     runs bigint NOT NULL DEFAULT 0,
     bytes bigint NOT NULL DEFAULT 0,
-    PRIMARY KEY (cell, day)
+    PRIMARY KEY (cell, day, connection)
 );
 
 -- Counts what a cell sends. Raises an error that passes with the day where its quota is used up: the cell waits, and keeps its records.
@@ -44,17 +45,22 @@ CREATE FUNCTION count_usage(of_cell integer, of_runs bigint, of_bytes bigint) RE
 LANGUAGE plpgsql SET search_path = regrind, pg_temp AS $$
 DECLARE
     today constant date := (now() AT TIME ZONE 'UTC')::date;
-    used cell_usage%ROWTYPE;
+    used_runs bigint;
+    used_bytes bigint;
 BEGIN
-    INSERT INTO cell_usage AS u (cell, day, runs, bytes) VALUES (of_cell, today, of_runs, of_bytes)
-        ON CONFLICT (cell, day) DO UPDATE SET runs = u.runs + excluded.runs, bytes = u.bytes + excluded.bytes
-        RETURNING u.* INTO used;
-    IF of_runs > 0 AND used.runs > quota_of('runs_per_day') THEN
+    UPDATE cell_usage SET runs = runs + of_runs, bytes = bytes + of_bytes WHERE cell = of_cell AND day = today AND connection = pg_backend_pid();
+    IF NOT FOUND THEN
+        INSERT INTO cell_usage (cell, day, runs, bytes) VALUES (of_cell, today, of_runs, of_bytes);
+        DELETE FROM cell_usage u USING (SELECT o.ctid FROM cell_usage o WHERE o.cell = of_cell AND o.day < today - 31 FOR UPDATE SKIP LOCKED) old
+            WHERE u.ctid = old.ctid;
+    END IF;
+    SELECT sum(runs), sum(bytes) INTO used_runs, used_bytes FROM cell_usage WHERE cell = of_cell AND day = today;
+    IF of_runs > 0 AND used_runs > quota_of('runs_per_day') THEN
         RAISE EXCEPTION 'this cell has begun to send % runs today, the most of a day', quota_of('runs_per_day')
             USING ERRCODE = 'configuration_limit_exceeded', HINT = 'it goes on tomorrow; the owner of the plant can raise it: regrind plant quota';
     END IF;
     -- One that is larger than the quota of a whole day would never arrive.
-    IF of_bytes > 0 AND used.bytes > quota_of('bytes_per_day') AND used.bytes > of_bytes THEN
+    IF of_bytes > 0 AND used_bytes > quota_of('bytes_per_day') AND used_bytes > of_bytes THEN
         RAISE EXCEPTION 'this cell has sent % bytes today, the most of a day', quota_of('bytes_per_day')
             USING ERRCODE = 'configuration_limit_exceeded', HINT = 'it goes on tomorrow; the owner of the plant can raise it: regrind plant quota';
     END IF;
@@ -162,7 +168,6 @@ BEGIN
         RETURN;
     END IF;
     UPDATE run SET records = r.records + given, head = hashes[given], arrived_at = now() WHERE run.id = of_run;
-    -- Last, as in every function: the row of a cell and a day is never waited for by who holds it.
     PERFORM count_usage(mine, 0, sent);
     RETURN QUERY SELECT r.records + given, hashes[given], NULL::text;
 END $$;
