@@ -10,11 +10,13 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use data_encoding::HEXLOWER;
 use regrind_formats::{ScratchFolder, move_folder};
 use regrind_journal::{Artefact, Reader, Record, RecordKind, is_plain_name};
 use tokio_postgres::Transaction;
+use tokio_postgres::error::SqlState;
 use tokio_postgres::types::ToSql;
 
 use super::copy::PlantRun;
@@ -24,6 +26,10 @@ use super::settings::ArtefactSettings;
 
 /// Number of records that are restored at once.
 const BATCH: usize = 1000;
+/// Maximum number of tries to remove what is archived, and the time between two.
+const MAX_TRIES: usize = 120;
+const BETWEEN_TRIES: Duration = Duration::from_millis(500);
+const REMOVE: &str = "SELECT records, contents FROM remove_archived($1)";
 
 /// Result of an archiving.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -75,14 +81,31 @@ pub async fn archive_runs(
                 Err(error) => return Err(error),
             }
         }
-        let failed = refused("the removal of archived runs");
-        let row = link.client().query_one("SELECT records, contents FROM remove_archived($1)", &[&block]).await;
-        let row = row.map_err(failed)?;
-        let [records, contents] = [0, 1].map(|k| u64::try_from(row.get::<_, i64>(k)).unwrap_or(0));
+        let [records, contents] = remove_archived(link, block).await?;
         result.records += records;
         result.contents += contents;
     }
     Ok(result)
+}
+
+/// Removes the records and files of the archived runs of a block from the database. Returns the number of records, then
+/// the number of contents of files. Tries again while cells and readers hold the tables of the block.
+async fn remove_archived(link: &DatabaseLink, block: i32) -> Result<[u64; 2], PlantError> {
+    let passes = |error: &tokio_postgres::Error| {
+        error.code().is_some_and(|code| [SqlState::T_R_DEADLOCK_DETECTED, SqlState::LOCK_NOT_AVAILABLE].contains(code))
+    };
+    for _ in 1..MAX_TRIES {
+        match link.client().query_one(REMOVE, &[&block]).await {
+            Err(error) if passes(&error) => tokio::time::sleep(BETWEEN_TRIES).await,
+            other => return removed(other),
+        }
+    }
+    removed(link.client().query_one(REMOVE, &[&block]).await)
+}
+
+fn removed(row: Result<super::Row, tokio_postgres::Error>) -> Result<[u64; 2], PlantError> {
+    let row = row.map_err(refused("the removal of archived runs"))?;
+    Ok([0, 1].map(|k| u64::try_from(row.get::<_, i64>(k)).unwrap_or(0)))
 }
 
 async fn blocks(link: &DatabaseLink, before: &str) -> Result<Vec<i32>, PlantError> {

@@ -170,9 +170,10 @@ FROM month_block b JOIN run r ON r.id >= b.first AND r.id < b.behind JOIN cell c
 WHERE r.archived_at IS NULL AND r.records > 0;
 
 -- Removes the records and files of the runs of a block that were archived. A block without other runs is dropped as a whole. Contents that no
--- other run names, and that taught nothing, go with them. Answers with the numbers of records and contents.
+-- other run names, and that taught nothing, go with them. Answers with the numbers of records and contents. A table that is dropped must be
+-- free: where readers and cells hold it, the caller tries again, so that nobody waits behind this for long.
 CREATE FUNCTION remove_archived(of_block integer) RETURNS TABLE (records bigint, contents bigint)
-LANGUAGE plpgsql SET search_path = regrind, pg_temp AS $$
+LANGUAGE plpgsql SET search_path = regrind, pg_temp SET lock_timeout = '500ms' AS $$
 #variable_conflict use_column
 DECLARE
     b month_block%ROWTYPE;
@@ -192,7 +193,6 @@ BEGIN
     is_whole := b.month < date_trunc('month', now() AT TIME ZONE 'UTC')
         AND NOT EXISTS (SELECT FROM run r WHERE r.id >= b.first AND r.id < b.behind AND r.archived_at IS NULL);
     IF is_whole THEN
-        -- A cell that tells of an old run waits here for a moment.
         EXECUTE (SELECT coalesce(string_agg(format('DROP TABLE %s;', i.inhrelid::regclass), ' '), '')
             FROM pg_inherits i JOIN pg_class p ON p.oid = i.inhrelid
             WHERE i.inhparent IN ('record'::regclass, 'run_artefact'::regclass)

@@ -5,10 +5,12 @@ use std::fs;
 use regrind::journal::{sha256_hex, verify};
 use serde_json::Value;
 
+use super::faults::{link, runtime};
 use super::records::made;
 use super::rights::{journal, ship};
 use crate::Plant;
 use crate::postgres::{OWNER, Postgres};
+use crate::program::{Running, regrind};
 
 /// Makes all blocks so far, and what is in them, those of a month that is long over.
 fn grow_old(plant: &Plant) {
@@ -153,6 +155,31 @@ fn what_cannot_be_archived_stays() {
     // Only the owner archives.
     plant.somebody("planner", "planner");
     plant.ends(&["plant", "archive", "--before", "2025-01", "--out", "old", "--plant", "planner.toml"], 2);
+}
+
+/// The tables of a month are dropped when nobody reads them. Meanwhile no reader and no cell waits for long.
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn archive_waits_for_readers() {
+    let plant = Plant::new();
+    plant.cell("cell-1", &[]);
+    plant.somebody("office", "reader");
+    journal(&plant, "runs", "run-1", "SN-1");
+    plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+    grow_old(&plant);
+    runtime().block_on(async {
+        let mut reader = link(&plant, "office").await;
+        let reads = reader.client_mut().transaction().await.unwrap();
+        reads.query_one("SELECT count(*) FROM record", &[]).await.unwrap();
+        let more = ["--before", "2025-01", "--out", "old", "--plant", "owner.toml"];
+        let mut archive = Running::new(regrind(&[&["plant", "archive"], &more[..]].concat(), plant.home.path()));
+        let tries = || plant.postgres.log().matches("due to lock timeout").count();
+        archive.until("two tries", |_| (tries() > 1).then_some(()));
+        reads.commit().await.unwrap();
+        let (code, told) = archive.end();
+        assert_eq!((code, &told[..]), (0, ""));
+    });
+    assert_eq!(plant.sql("SELECT count(*) FROM record"), "0");
 }
 
 #[test]

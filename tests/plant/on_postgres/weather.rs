@@ -387,5 +387,7 @@ fn failures_duplicate_no_record_or_part() {
 #[test]
 #[ignore = "takes half an hour, for .ci/long; needs PostgreSQL and mosquitto (Debian packages)"]
 fn two_hundred_parts_of_eight_cells() {
-    weather(2, 8, 200);
+    // REGRIND_PARTS: another number of parts.
+    let parts = std::env::var("REGRIND_PARTS").map_or(200, |parts| parts.parse().unwrap());
+    weather(2, 8, parts);
 }
