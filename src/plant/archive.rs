@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use data_encoding::HEXLOWER;
 use regrind_formats::{ScratchFolder, move_folder};
-use regrind_journal::{Artefact, Reader, Record, RecordKind, is_plain_name};
+use regrind_journal::{Artefact, JournalError, Reader, Record, RecordKind, is_plain_name};
 use tokio_postgres::Transaction;
 use tokio_postgres::error::SqlState;
 use tokio_postgres::types::ToSql;
@@ -29,7 +29,8 @@ const BATCH: usize = 1000;
 /// Maximum number of tries to remove what is archived, and the time between two.
 const MAX_TRIES: usize = 120;
 const BETWEEN_TRIES: Duration = Duration::from_millis(500);
-const REMOVE: &str = "SELECT records, contents FROM remove_archived($1)";
+/// Number of contents that are removed at once.
+const CONTENTS: i32 = 1000;
 
 /// Result of an archiving.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -81,31 +82,49 @@ pub async fn archive_runs(
                 Err(error) => return Err(error),
             }
         }
-        let [records, contents] = remove_archived(link, block).await?;
-        result.records += records;
-        result.contents += contents;
+        result.records += count(&while_in_use(link, "SELECT remove_records($1)", &[&block]).await?, 0);
     }
+    result.contents = remove_contents(link).await?;
     Ok(result)
 }
 
-/// Removes the records and files of the archived runs of a block from the database. Returns the number of records, then
-/// the number of contents of files. Tries again while cells and readers hold the tables of the block.
-async fn remove_archived(link: &DatabaseLink, block: i32) -> Result<[u64; 2], PlantError> {
+/// Removes the contents of files from the database that only archived runs name. Returns their number.
+async fn remove_contents(link: &DatabaseLink) -> Result<u64, PlantError> {
+    while_in_use(link, "SELECT wait_for_writers()", &[]).await?;
+    let failed = refused("the removal of archived files");
+    link.client().execute("SELECT keep_named_contents()", &[]).await.map_err(&failed)?;
+    let mut contents = 0;
+    loop {
+        let text = "SELECT looked, removed FROM remove_contents($1)";
+        let row = link.client().query_one(text, &[&CONTENTS]).await.map_err(&failed)?;
+        contents += count(&row, 1);
+        if count(&row, 0) == 0 {
+            return Ok(contents);
+        }
+    }
+}
+
+/// Runs a query that needs tables for a moment. Tries again while cells and readers hold them.
+async fn while_in_use(
+    link: &DatabaseLink,
+    text: &str,
+    values: &[&(dyn ToSql + Sync)],
+) -> Result<super::Row, PlantError> {
     let passes = |error: &tokio_postgres::Error| {
         error.code().is_some_and(|code| [SqlState::T_R_DEADLOCK_DETECTED, SqlState::LOCK_NOT_AVAILABLE].contains(code))
     };
+    let failed = refused("a step of the archive");
     for _ in 1..MAX_TRIES {
-        match link.client().query_one(REMOVE, &[&block]).await {
+        match link.client().query_one(text, values).await {
             Err(error) if passes(&error) => tokio::time::sleep(BETWEEN_TRIES).await,
-            other => return removed(other),
+            other => return other.map_err(failed),
         }
     }
-    removed(link.client().query_one(REMOVE, &[&block]).await)
+    link.client().query_one(text, values).await.map_err(failed)
 }
 
-fn removed(row: Result<super::Row, tokio_postgres::Error>) -> Result<[u64; 2], PlantError> {
-    let row = row.map_err(refused("the removal of archived runs"))?;
-    Ok([0, 1].map(|k| u64::try_from(row.get::<_, i64>(k)).unwrap_or(0)))
+fn count(row: &super::Row, column: usize) -> u64 {
+    u64::try_from(row.get::<_, i64>(column)).unwrap_or(0)
 }
 
 async fn blocks(link: &DatabaseLink, before: &str) -> Result<Vec<i32>, PlantError> {
@@ -146,15 +165,15 @@ async fn archive_run(
     let place = folder.join(&run.month).join(cell).join(name);
     let found = PlantRun::find(link, Some(&run.cell), &run.name).await?;
     if !place.exists() {
-        let scratch = ScratchFolder::at(folder.join(".archiving"))?;
+        let scratch = ScratchFolder::at(folder.join(format!(".archiving-{}", std::process::id())))?;
         // The name of the folder is that of the run, as the record says.
         let copy = scratch.path().join(name);
         found.fetch(link, artefacts, &copy).await?;
-        found.prove(&copy, &[])?;
+        prove(link, &found, &copy).await?;
         move_folder(&copy, &place)?;
     }
     // An earlier call can have ended between the move and the mark.
-    found.prove(&place, &[])?;
+    prove(link, &found, &place).await?;
     let place = fs::canonicalize(&place).unwrap_or(place).display().to_string();
     let head = HEXLOWER.decode(found.head.as_bytes()).unwrap_or_default();
     let mark = "UPDATE run SET archived_at = now(), archive = $2 WHERE id = $1 AND head = $3 AND archived_at IS NULL";
@@ -162,6 +181,26 @@ async fn archive_run(
     match link.client().execute(mark, &values).await.map_err(refused("the mark of an archived run"))? {
         0 => Ok(Some("records arrived while it was archived; archive it again".into())),
         _ => Ok(None),
+    }
+}
+
+/// Proves a run folder with the keys of its cell. A run that arrived before its cell had a key is proven by its chain alone,
+/// if it is not signed.
+async fn prove(link: &DatabaseLink, run: &PlantRun, folder: &Path) -> Result<(), PlantError> {
+    let proven = run.prove(folder, &[]);
+    if !matches!(proven, Err(PlantError::Journal(JournalError::NoAuthor { .. }))) {
+        return proven.map(drop);
+    }
+    let text =
+        "SELECT r.arrived_at < (SELECT min(k.since) FROM cell_key k WHERE k.cell = r.cell) FROM run r WHERE r.id = $1";
+    let row = link.client().query_one(text, &[&run.id]).await.map_err(refused("the keys of a cell"))?;
+    let without_keys = PlantRun { keys: Vec::new(), ..run.clone() };
+    match row.get::<_, Option<bool>>(0) {
+        Some(true) => without_keys.prove(folder, &[]).and_then(|verified| match verified.signed {
+            0 => Ok(()),
+            _ => proven.map(drop),
+        }),
+        _ => proven.map(drop),
     }
 }
 
@@ -175,15 +214,18 @@ pub async fn restore_run(link: &mut DatabaseLink, folder: &Path) -> Result<Strin
     let records: Vec<Record> = Reader::open(folder)?.records(1).collect::<Result<_, _>>()?;
     let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let head = records.last().map(|last| last.hash.clone()).unwrap_or_default();
-    let text = "SELECT c.name, r.id, r.cell FROM run r JOIN cell c ON c.id = r.cell
+    let text = "SELECT c.name, r.id, r.cell, r.archive FROM run r JOIN cell c ON c.id = r.cell
         WHERE r.name = $1 AND r.head = decode($2, 'hex') AND r.archived_at IS NOT NULL";
-    let row = link.client().query_opt(text, &[&name, &head]).await.map_err(refused("to find a run"))?;
-    let no_run = || PlantError::NotArchived { folder: folder.to_owned() };
-    let row = row.ok_or_else(no_run)?;
+    let rows = link.client().query(text, &[&name, &head]).await.map_err(refused("to find a run"))?;
+    // Two cells can have the same run. Then its place in the archive decides.
+    let place = fs::canonicalize(folder).unwrap_or_else(|_| folder.to_owned()).display().to_string();
+    let is_here = |row: &&super::Row| row.get::<_, Option<&str>>(3) == Some(&place);
+    let row = rows.iter().find(is_here).or_else(|| rows.first().filter(|_| rows.len() == 1));
+    let row = row.ok_or_else(|| PlantError::NotArchived { folder: folder.to_owned() })?;
     let (cell, id, cell_id): (String, i32, i32) = (row.get(0), row.get(1), row.get(2));
-    PlantRun::find(link, Some(&cell), &name).await?.prove(folder, &[])?;
+    prove(link, &PlantRun::find(link, Some(&cell), &name).await?, folder).await?;
+    while_in_use(link, "SELECT restore_partitions($1)", &[&id]).await?;
     let step = link.client_mut().transaction().await.map_err(refused("a run from the archive"))?;
-    step.execute("SELECT restore_partitions($1)", &[&id]).await.map_err(refused("a month of the archive"))?;
     for batch in records.chunks(BATCH) {
         put_records(&step, id, batch).await?;
     }
@@ -192,7 +234,7 @@ pub async fn restore_run(link: &mut DatabaseLink, folder: &Path) -> Result<Strin
             put_file(&step, (id, cell_id), folder, &file).await?;
         }
     }
-    let mark = "UPDATE run SET archived_at = NULL, archive = NULL WHERE id = $1";
+    let mark = "UPDATE run SET archived_at = NULL, archive = NULL, numbering = NULL WHERE id = $1";
     step.execute(mark, &[&id]).await.map_err(refused("the mark of a run"))?;
     step.commit().await.map_err(refused("a run from the archive"))?;
     Ok(format!("{name} of {cell}"))
@@ -204,7 +246,7 @@ async fn put_records(step: &Transaction<'_>, run: i32, records: &[Record]) -> Re
         records.iter().map(|record| HEXLOWER.decode(record.hash.as_bytes()).unwrap_or_default()).collect();
     let texts: Vec<String> = records.iter().map(Record::text).collect();
     let put = "INSERT INTO record (run, seq, hash, text) SELECT $1, seq, hash, text
-        FROM unnest($2::int[], $3::bytea[], $4::text[]) AS u (seq, hash, text)";
+        FROM unnest($2::int[], $3::bytea[], $4::text[]) AS u (seq, hash, text) ON CONFLICT DO NOTHING";
     let values: [&(dyn ToSql + Sync); 4] = [&run, &seqs, &hashes, &texts];
     step.execute(put, &values).await.map(drop).map_err(refused("records from the archive"))
 }

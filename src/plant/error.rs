@@ -159,7 +159,7 @@ pub(crate) fn passing(place: &str, code: &str, said: &str) -> Option<PlantError>
         // Classes 53 (a limit of the server) and 58 (an error of its operating system).
         _ if is_of(&["53", "58"]) => fault("look into the log of the database"),
         // Classes 57 (the server shuts down or starts), 08 (the connection), and 40 (a lost race).
-        _ if is_of(&["57", "08", "40"]) => Some(PlantError::Unreachable { place: place.to_owned(), what }),
+        _ if is_of(&["57", "08", "40", "55P03"]) => Some(PlantError::Unreachable { place: place.to_owned(), what }),
         _ => None,
     }
 }

@@ -56,8 +56,9 @@ impl RunGap {
     /// # Errors
     /// The plant cannot be reached or refuses the query.
     pub async fn all(link: &DatabaseLink) -> Result<Vec<Self>, PlantError> {
-        let text = "SELECT c.name, r.name, e.text FROM run r JOIN cell c ON c.id = r.cell JOIN record e ON e.run = r.id AND e.seq = 1
-            ORDER BY r.id";
+        let text = "SELECT c.name, r.name, coalesce(r.numbering, e.text) FROM run r JOIN cell c ON c.id = r.cell
+            LEFT JOIN record e ON e.run = r.id AND e.seq = 1 AND r.numbering IS NULL
+            WHERE r.numbering IS NOT NULL OR e.text IS NOT NULL ORDER BY r.id";
         let rows = link.client().query(text, &[]).await.map_err(refused("the first records"))?;
         let places: Vec<RunPlace> = rows.iter().map(|row| place_of(row.get(0), row.get(1), row.get(2))).collect();
         let absent = absent(&places);
@@ -104,7 +105,8 @@ async fn found_elsewhere(link: &DatabaseLink, absent: &[Predecessor]) -> Result<
         asked.iter().map(|run| HEXLOWER.decode(run.head.as_bytes()).unwrap_or_default()).collect();
     let text =
         "SELECT DISTINCT n FROM unnest($1::text[], $2::integer[], $3::bytea[]) WITH ORDINALITY AS a (run, seq, hash, n)
-        JOIN run r ON r.name = a.run JOIN record e ON e.run = r.id AND e.seq = a.seq AND e.hash = a.hash";
+        JOIN run r ON r.name = a.run LEFT JOIN record e ON e.run = r.id AND e.seq = a.seq
+        WHERE e.hash = a.hash OR (r.archived_at IS NOT NULL AND (r.records > a.seq OR (r.records = a.seq AND r.head = a.hash)))";
     let rows =
         link.client().query(text, &[&names, &records, &heads]).await.map_err(refused("the runs of other cells"))?;
     let place = |row: &tokio_postgres::Row| usize::try_from(row.get::<_, i64>(0) - 1).ok();

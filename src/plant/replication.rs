@@ -408,7 +408,10 @@ impl Replicator {
                 bytes >> 20
             )));
         } else {
-            link.client().query_one("SELECT give_artefact($1, $2)", &[&sha256, &content]).await.map_err(failed)?;
+            let given = link.client().query_one("SELECT give_artefact($1, $2)", &[&sha256, &content]).await;
+            if !given.map_err(failed)?.get::<_, bool>(0) {
+                return Ok(Some("was refused by the plant: it is larger than the quota file_bytes".into()));
+            }
         }
         Ok(None)
     }

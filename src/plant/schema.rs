@@ -23,6 +23,12 @@ const MIGRATIONS: [(i32, &str); 11] = [
 /// Groups of roles. Each role that signs in is a member of one group.
 const GROUPS: [&str; 4] = ["regrind_cell", "regrind_reader", "regrind_planner", "regrind_worker"];
 
+/// Rights that PostgreSQL gives to everybody and that no member of a plant has: to execute a function that no member is
+/// named for, also as a trigger on a table of his own, and to make such a table.
+const RIGHTS: &str = "REVOKE EXECUTE ON ALL FUNCTIONS IN SCHEMA regrind FROM PUBLIC;
+    GRANT EXECUTE ON FUNCTION regrind.told_number(jsonb), regrind.told_whole(jsonb), regrind.told_truth(jsonb) TO regrind_reader;
+    DO $$ BEGIN EXECUTE format('REVOKE TEMPORARY ON DATABASE %I FROM PUBLIC', current_database()); END $$";
+
 /// Key of the advisory lock that stops two programs from changing the layout at once.
 const LOCK: i64 = 0x5267_7264_506c_616e;
 
@@ -65,6 +71,7 @@ pub async fn migrate(link: &mut DatabaseLink) -> Result<[i32; 2], PlantError> {
         let put = "INSERT INTO regrind.migration (version, sha256) VALUES ($1, $2)";
         step.execute(put, &[version, &sha256]).await.map_err(&failed)?;
     }
+    step.batch_execute(RIGHTS).await.map_err(&failed)?;
     step.commit().await.map_err(&failed)?;
     Ok([before, known()])
 }
@@ -235,7 +242,7 @@ async fn make_role(
     let text = match groups.as_deref() {
         // Its other rights were given when it was made. Only a superuser may state them again.
         Some([only]) if only == group && is_again => {
-            "SELECT format('ALTER ROLE %I LOGIN PASSWORD %L', $1::text, $2::text)"
+            "SELECT format('ALTER ROLE %I LOGIN PASSWORD %L', $1::text, $2::text) WHERE $3::text IS NOT NULL"
         }
         Some([only]) if only == group => {
             return refused_member(
@@ -251,10 +258,11 @@ async fn make_role(
         }
         None if is_again => return refused_member("it is not enrolled; leave out --again".into()),
         None => {
-            "SELECT format('CREATE ROLE %I LOGIN NOSUPERUSER NOCREATEDB NOCREATEROLE NOREPLICATION NOBYPASSRLS PASSWORD %L', $1::text, $2::text)"
+            "SELECT format('CREATE ROLE %I LOGIN NOSUPERUSER NOCREATEDB NOCREATEROLE NOREPLICATION NOBYPASSRLS CONNECTION LIMIT %s PASSWORD %L',
+                $1::text, CASE $3::text WHEN 'regrind_cell' THEN 12 ELSE -1 END, $2::text)"
         }
     };
-    let made = step.query_one(text, &[&role, &password]).await.map_err(&failed)?;
+    let made = step.query_one(text, &[&role, &password, &group]).await.map_err(&failed)?;
     step.batch_execute(made.get(0)).await.map_err(&failed)?;
     if groups.is_none() {
         let grant = step.query_one("SELECT format('GRANT %I TO %I', $1::text, $2::text)", &[&group, &role]).await;

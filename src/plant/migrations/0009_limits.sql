@@ -204,10 +204,10 @@ BEGIN
             CASE told ->> 'kind'
             WHEN 'begin' THEN
                 content := told -> 'payload' -> 'content';
-                UPDATE run SET part = told ->> 'part', operator = told ->> 'actor', began = believed_time(r.name, told ->> 'utc'),
-                    simulation = (told -> 'payload' ->> 'simulation')::boolean, part_name = content ->> 'part_name',
-                    recipe_sha256 = content ->> 'recipe_sha256',
-                    recipe = regexp_replace(content ->> 'recipe', '^.*[/\\]|\.toml$', '', 'g')
+                UPDATE run SET part = left(told ->> 'part', 300), operator = left(told ->> 'actor', 300), began = believed_time(r.name, told ->> 'utc'),
+                    simulation = (told -> 'payload' ->> 'simulation')::boolean, part_name = left(content ->> 'part_name', 300),
+                    recipe_sha256 = left(content ->> 'recipe_sha256', 64),
+                    recipe = left(regexp_replace(left(content ->> 'recipe', 4096), '^.*[/\\]|\.toml$', '', 'g'), 300)
                     WHERE id = r.id;
             WHEN 'end' THEN
                 UPDATE run SET ended = believed_time(r.name, told ->> 'utc') WHERE id = r.id;
@@ -223,7 +223,9 @@ BEGIN
     END LOOP;
 END $$;
 
--- What a cell told of times before is read again.
+-- What a cell told before is cut too. What it told of times before is read again.
+UPDATE run SET part = left(part, 300), operator = left(operator, 300), part_name = left(part_name, 300), recipe = left(recipe, 300)
+    WHERE greatest(length(part), length(operator), length(part_name), length(recipe)) > 300;
 UPDATE run SET began = least(began, arrived_at) WHERE began > arrived_at + interval '1 day';
 UPDATE run SET ended = least(ended, arrived_at) WHERE ended > arrived_at + interval '1 day';
 
@@ -244,7 +246,11 @@ BEGIN
         PERFORM complain(of_name, 'a report refused', format('its figures have %s bytes, or more cycles than %s', octet_length(told::text), quota_of('cycles_per_run')));
         RETURN;
     END IF;
-    INSERT INTO cycle SELECT of_run, f.* FROM jsonb_to_recordset(told -> 'cycles') AS f (
+    -- A report has all cycles of its run.
+    DELETE FROM cycle y WHERE y.run = of_run AND NOT EXISTS (SELECT FROM jsonb_array_elements(told -> 'cycles') c WHERE c -> 'cycle' = to_jsonb(y.cycle));
+    INSERT INTO cycle SELECT of_run, f.cycle, left(f.verdict, 300), left(f.reason, 1000), f.pv_um, f.pv_u_um, f.rms_um, f.rms_u_um, f.expected_pv_um,
+            f.expected_rms_um, left(f.map, 300)
+        FROM jsonb_to_recordset(told -> 'cycles') AS f (
             cycle integer, verdict text, reason text, pv_um double precision, pv_u_um double precision, rms_um double precision,
             rms_u_um double precision, expected_pv_um double precision, expected_rms_um double precision, map text)
         ON CONFLICT (run, cycle) DO UPDATE SET (verdict, reason, pv_um, pv_u_um, rms_um, rms_u_um, expected_pv_um, expected_rms_um, map)
@@ -323,7 +329,8 @@ BEGIN
     SELECT max(e.seq) INTO first FROM record e WHERE e.run = r.id AND e.text ~ '"kind":"artefact","mono_ns":'
         AND e.text LIKE '%"sha256":"' || encode(of_sha256, 'hex') || '"%' AND e.text::json -> 'payload' ->> 'name' = 'learned.json';
     SELECT e.text::json INTO seal FROM record e WHERE e.run = r.id AND e.seq = r.records;
-    IF first IS NULL OR first < 2 OR r.records - first > 60 OR seal ->> 'kind' IS DISTINCT FROM 'seal'
+    IF first IS NULL OR first < 2 OR r.records - first > 60
+        OR (SELECT sum(octet_length(e.text)) FROM record e WHERE e.run = r.id AND e.seq >= first) > 1048576 OR seal ->> 'kind' IS DISTINCT FROM 'seal'
         OR NOT EXISTS (SELECT FROM cell_key k WHERE k.cell = r.cell AND k.key = seal -> 'payload' ->> 'key') THEN
         RETURN;
     END IF;
@@ -412,7 +419,18 @@ END $$;
 -- A name that was typed wrongly must not use up a version: a key can sign again, and the name of a person blocks no other key. A cell
 -- counts the signatures of the people in its own plant file.
 ALTER TABLE approval DROP CONSTRAINT approval_recipe_person_key;
-ALTER TABLE approval ADD COLUMN earlier_names text[] NOT NULL DEFAULT '{}';
+-- Signatures that were replaced.
+CREATE TABLE approval_replaced (
+    id bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
+    recipe bytea NOT NULL REFERENCES recipe,
+    person text NOT NULL,
+    key text NOT NULL,
+    signature text NOT NULL,
+    at timestamptz NOT NULL,
+    by name NOT NULL,
+    replaced_at timestamptz NOT NULL DEFAULT now(),
+    replaced_by name NOT NULL DEFAULT session_user
+);
 DROP POLICY signs ON approval;
 REVOKE INSERT (recipe, person, key, signature) ON approval FROM regrind_planner;
 
@@ -435,9 +453,17 @@ BEGIN
         RETURN QUERY SELECT in_the_way.person, in_the_way.key;
         RETURN;
     END IF;
+    IF EXISTS (SELECT FROM recipe r WHERE r.sha256 = of_recipe AND r.withdrawn_at IS NOT NULL) THEN
+        RAISE EXCEPTION 'this version was withdrawn' USING ERRCODE = 'check_violation', HINT = 'propose the recipe again: regrind plant propose';
+    END IF;
+    IF in_the_way.key = by_key THEN
+        INSERT INTO approval_replaced (recipe, person, key, signature, at, by) SELECT a.recipe, a.person, a.key, a.signature, a.at, a.by
+            FROM approval a WHERE a.recipe = of_recipe AND a.key = by_key;
+        PERFORM complain(NULL, 'a signature replaced', format('the signature of %s on recipe %s is replaced by one of %s with the same key',
+            in_the_way.person, left(encode(of_recipe, 'hex'), 12), by_person));
+    END IF;
     INSERT INTO approval AS a (recipe, person, key, signature) VALUES (of_recipe, by_person, by_key, its_signature)
-        ON CONFLICT (recipe, key) DO UPDATE SET (person, signature, at, by, earlier_names)
-            = (excluded.person, excluded.signature, now(), session_user, a.earlier_names || a.person);
+        ON CONFLICT (recipe, key) DO UPDATE SET (person, signature, at, by) = (excluded.person, excluded.signature, now(), session_user);
 END $$;
 
 -- The text of a recipe that was withdrawn comes back under its name, as the next version, which two people sign anew.
@@ -499,7 +525,35 @@ CREATE FUNCTION leave_queue(of_recipe bytea) RETURNS text[] LANGUAGE sql SET sea
 $$;
 SELECT leave_queue(sha256) FROM recipe WHERE withdrawn_at IS NOT NULL;
 
+-- A part that comes back to the queue, or comes into it while its recipe is withdrawn, would wait for ever.
+CREATE FUNCTION leave_withdrawn() RETURNS trigger LANGUAGE plpgsql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
+DECLARE
+    withdrawn timestamptz;
+BEGIN
+    SELECT withdrawn_at INTO withdrawn FROM recipe WHERE sha256 = new.recipe FOR SHARE;
+    IF withdrawn IS NOT NULL THEN
+        new.state := 'withdrawn';
+        IF TG_OP = 'UPDATE' THEN
+            INSERT INTO work_step (work, step, words) VALUES (new.id, 'withdrawn', 'its recipe was withdrawn');
+        END IF;
+    END IF;
+    RETURN new;
+END $$;
+CREATE TRIGGER leave_withdrawn BEFORE INSERT OR UPDATE OF state ON work FOR EACH ROW WHEN (new.state = 'open') EXECUTE FUNCTION leave_withdrawn();
+
 -- ---- studies -------------------------------------------------------------------------------------------------------------
+
+-- Takes the result of a job. Answers whether the lease still held: another worker has the job where it did not.
+CREATE OR REPLACE FUNCTION finish_job(of_study integer, of_job integer, of_lease integer, has_failed boolean, of_result jsonb) RETURNS boolean
+LANGUAGE plpgsql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
+DECLARE
+    is_long constant boolean := octet_length(of_result::text) > quota_of('state_bytes');
+BEGIN
+    UPDATE study_job SET state = CASE WHEN has_failed OR is_long THEN 'failed' ELSE 'done' END, done_at = now(),
+        result = CASE WHEN is_long THEN '{"error": "the result is too long"}' ELSE of_result END
+        WHERE study = of_study AND job = of_job AND lease = of_lease AND state = 'leased' AND worker = session_user;
+    RETURN FOUND;
+END $$;
 
 -- Gives a job more time, from now. Answers whether the lease still held.
 CREATE FUNCTION renew_job(of_study integer, of_job integer, of_lease integer, seconds integer) RETURNS boolean
@@ -510,13 +564,30 @@ BEGIN
     RETURN FOUND;
 END $$;
 
+-- ---- connections ---------------------------------------------------------------------------------------------------------
+
+-- A cell has a few programs. No cell takes the connections of the others.
+DO $$
+DECLARE
+    of_cell name;
+BEGIN
+    FOR of_cell IN SELECT role FROM regrind.cell LOOP
+        EXECUTE format('ALTER ROLE %I CONNECTION LIMIT 12', of_cell);
+    END LOOP;
+EXCEPTION WHEN insufficient_privilege OR undefined_object THEN
+    -- The roles of a restored database can be missing, or another role made them.
+    NULL;
+END $$;
+
 -- ---- rights --------------------------------------------------------------------------------------------------------------
 
 ALTER TABLE quota ENABLE ROW LEVEL SECURITY;
 ALTER TABLE cell_usage ENABLE ROW LEVEL SECURITY;
 CREATE POLICY everything ON quota FOR SELECT TO regrind_reader USING (true);
 CREATE POLICY everything ON cell_usage FOR SELECT TO regrind_reader USING (true);
-GRANT SELECT ON quota, cell_usage TO regrind_reader;
+ALTER TABLE approval_replaced ENABLE ROW LEVEL SECURITY;
+CREATE POLICY everything ON approval_replaced FOR SELECT TO regrind_reader USING (true);
+GRANT SELECT ON quota, cell_usage, approval_replaced TO regrind_reader;
 REVOKE ALL ON newest_lesson FROM PUBLIC;
 REVOKE EXECUTE ON FUNCTION quota_of(text), set_quota(text, bigint), count_usage(integer, bigint, bigint), believed_time(text, text), proof_of_lesson(run, bytea),
     lessons(text, boolean), lessons_in_common(boolean), sign_recipe(bytea, text, text, text, boolean), withdraw_recipe(text, integer, text), leave_queue(bytea),

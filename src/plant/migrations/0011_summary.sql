@@ -18,6 +18,9 @@ UPDATE work_step s SET simulation = newest_is_simulated(w.cell) FROM work w WHER
 
 CREATE FUNCTION mark_given_up() RETURNS trigger LANGUAGE plpgsql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
 BEGIN
+    IF TG_RELID <> 'regrind.work_step'::regclass THEN
+        RAISE EXCEPTION 'this function is for the table work_step alone' USING ERRCODE = 'insufficient_privilege';
+    END IF;
     new.simulation := newest_is_simulated((SELECT w.cell FROM work w WHERE w.id = new.work));
     RETURN new;
 END $$;
@@ -118,6 +121,9 @@ CREATE FUNCTION runs_changed() RETURNS trigger LANGUAGE plpgsql SECURITY DEFINER
 DECLARE
     changes run_change[];
 BEGIN
+    IF TG_RELID <> 'regrind.run'::regclass THEN
+        RAISE EXCEPTION 'this function is for the table run alone' USING ERRCODE = 'insufficient_privilege';
+    END IF;
     IF TG_OP = 'UPDATE' THEN
         changes := array(
             SELECT side.change FROM old_run o JOIN new_run n ON n.id = o.id CROSS JOIN LATERAL (
@@ -144,6 +150,9 @@ CREATE TRIGGER runs_deleted AFTER DELETE ON run REFERENCING OLD TABLE AS old_run
 -- Counts a part when it is given up, if its run has not ended.
 CREATE FUNCTION given_up() RETURNS trigger LANGUAGE plpgsql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
 BEGIN
+    IF TG_RELID <> 'regrind.work_step'::regclass THEN
+        RAISE EXCEPTION 'this function is for the table work_step alone' USING ERRCODE = 'insufficient_privilege';
+    END IF;
     PERFORM add_to_days(array(
         SELECT ROW((new.at AT TIME ZONE 'UTC')::date, w.cell, coalesce(r.recipe, p.name), coalesce(r.simulation, new.simulation, false), 'given up', NULL, 1)::part_change
         FROM work w JOIN recipe p ON p.sha256 = w.recipe LEFT JOIN run r ON r.cell = w.cell AND r.name = w.run

@@ -6,6 +6,7 @@ use regrind::journal::{sha256_hex, verify};
 use serde_json::Value;
 
 use super::faults::{link, runtime};
+use super::forged::Forged;
 use super::records::made;
 use super::rights::{journal, ship};
 use crate::Plant;
@@ -59,8 +60,8 @@ fn archived_run_is_proven_and_comes_back() {
     assert_eq!(shown("SELECT count(*) FROM record"), "0");
     assert_eq!(
         shown("SELECT count(*) FROM pg_inherits WHERE inhparent = 'record'::regclass"),
-        "1",
-        "that of the next month is left"
+        "2",
+        "those of the first block, which is empty, and of the next month"
     );
     assert_eq!(shown(figures), before, "lists and trends are unchanged");
 
@@ -78,8 +79,17 @@ fn archived_run_is_proven_and_comes_back() {
         let (_, told) = plant.ends(arguments, 2);
         assert!(told.contains("archived to") && told.contains("old/2024-11/cell-1"), "{told}");
     }
-    // The cell ships on: this run is there already, and another one arrives.
+    // The cell ships on: this run is there already, and another one arrives. The figures of an archived run stay.
     plant.does(&ship_it);
+    let tell = format!(
+        "SELECT tell_run({}, '{{\"result\":\"stopped\",\"cycles\":[{{\"cycle\":1,\"pv_um\":99}}]}}')",
+        shown("SELECT id FROM run")
+    );
+    plant.asked_by("cell-1", &tell).unwrap();
+    assert_eq!(shown(figures), before);
+    assert_eq!(shown("SELECT count(*) FROM cycle WHERE pv_um = 99"), "0");
+    // It is known among the runs that arrived.
+    plant.does(&["plant", "runs", "--missing", "--plant", "owner.toml"]);
     journal(&plant, "runs", "run-2", "SN-2");
     plant.does(&ship_it);
     assert_eq!(shown("SELECT count(DISTINCT run) FROM record"), "1");
@@ -182,6 +192,33 @@ fn archive_waits_for_readers() {
     assert_eq!(plant.sql("SELECT count(*) FROM record"), "0");
 }
 
+/// A copy of the run folder of another cell, and a run that arrived before its cell had a key.
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn same_run_of_two_cells_comes_back_to_each() {
+    let plant = Plant::new();
+    ["cell-1", "cell-2"].iter().for_each(|name| plant.cell(name, &[]));
+    Forged::named("run-1").write(&plant.path("runs/run-1"), 3);
+    for cell in ["cell-1", "cell-2"] {
+        plant.does(&["ship", "--once", "--plant", &format!("{cell}.toml")]);
+    }
+    let key = "ab".repeat(32);
+    plant.does(&["plant", "add-key", "cell-2", "--key", &key, "--plant", "owner.toml"]);
+    grow_old(&plant);
+    assert_eq!(archived(&plant, 0, &["--before", "2025-01", "--out", "old"])["runs"], 2);
+    let states = "SELECT c.name, archived_at IS NULL FROM run r JOIN cell c ON c.id = r.cell ORDER BY 1";
+    for (cell, then) in [("cell-2", "cell-1|f\ncell-2|t"), ("cell-1", "cell-1|t\ncell-2|t")] {
+        let folder = plant.path("old/2024-11").join(cell).join("run-1").display().to_string();
+        plant.does(&["plant", "unarchive", &folder, "--plant", "owner.toml"]);
+        assert_eq!(plant.sql(states), then);
+    }
+    // The program ended between the mark and the removal: the records are still there.
+    plant.sql("UPDATE run SET archived_at = now(), archive = 'x' WHERE cell = 1");
+    let folder = plant.path("old/2024-11/cell-1/run-1").display().to_string();
+    plant.does(&["plant", "unarchive", &folder, "--plant", "owner.toml"]);
+    plant.does(&["audit", "verify", "run-1", "--plant", "cell-1.toml"]);
+}
+
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
 fn new_month_gets_its_own_block() {
@@ -195,7 +232,7 @@ fn new_month_gets_its_own_block() {
     assert_eq!(open("run-3"), "4000001");
     assert_eq!(plant.sql(blocks), "1|5", "this month and the next one");
     // A block that is full.
-    plant.sql("UPDATE month_block SET next = behind WHERE first = 4000001");
+    plant.sql("SELECT setval('month_4000001', 6000000)");
     assert_eq!(open("run-4"), "8000001");
     let all = journal(&plant, "elsewhere", "run-4", "SN-4");
     assert_eq!(plant.asked_by("cell-1", &ship("8000001", 1, &all)).unwrap(), format!("{}|", all.len()));

@@ -40,6 +40,14 @@ fn oversized_state_is_refused() {
     plant.asked_by("cell-1", "SELECT tell_run(id, '{\"cycles\": 7}') FROM open_run('run-1')").unwrap();
     assert_eq!(counted(&plant, "a report refused"), "2|2");
     assert_eq!(plant.sql("SELECT count(*) FROM cycle"), "0");
+    // A report replaces the one before; its texts are cut.
+    for first in [1, 500] {
+        let told = format!(
+            "SELECT tell_run(id, jsonb_build_object('cycles', (SELECT jsonb_agg(jsonb_build_object('cycle', n, 'map', repeat('m', 5000))) FROM generate_series({first}, {first} + 2) n))) FROM open_run('run-1')"
+        );
+        plant.asked_by("cell-1", &told).unwrap();
+        assert_eq!(plant.sql("SELECT min(cycle), count(*), max(length(map)) FROM cycle"), format!("{first}|3|300"));
+    }
     let long = "SELECT refused FROM open_run('run-1') o CROSS JOIN LATERAL ship(o.id, 1, ARRAY['\\x00'::bytea], ARRAY[repeat('x', 9000000)])";
     assert!(plant.asked_by("cell-1", long).unwrap().contains("9000000 bytes"));
     quota(&plant, "file_bytes=10");
@@ -131,6 +139,19 @@ fn stated_place_keeps_no_content_out() {
     assert!(proven.contains("1 files"), "{proven}");
     // To state a place is not to have the content.
     assert_eq!(plant.asked_by("cell-2", "SELECT count(*) FROM record").unwrap(), "0");
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn long_names_are_cut_and_connections_are_few() {
+    let plant = Plant::new();
+    plant.cell("cell-1", &[]);
+    let long = "n".repeat(100_000);
+    journal(&plant, "runs", "run-1", &long);
+    plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+    assert_eq!(plant.sql("SELECT length(part), records > 8 FROM run"), "300|t");
+    plant.does(&["audit", "verify", "run-1", "--plant", "cell-1.toml"]);
+    assert_eq!(plant.sql("SELECT rolconnlimit FROM pg_roles WHERE rolname = 'cell_1'"), "12");
 }
 
 /// Returns the records with other times, in their own chain.

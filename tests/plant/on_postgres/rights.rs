@@ -119,7 +119,18 @@ fn cell_account_reads_only_its_own() {
     }
     // The functions of the plant do not see an attacker's table with the same name as one of the plant's.
     let shadow = "CREATE TEMP TABLE cell (id int, role name, retired_at timestamptz); INSERT INTO pg_temp.cell VALUES (1, 'cell_2', NULL); SELECT regrind.own_cell()";
+    assert!(plant.asked_by("cell-2", shadow).unwrap_err().contains("temporary"), "nobody makes temporary tables");
+    plant.sql("GRANT TEMPORARY ON DATABASE regrind TO cell_2");
     assert_eq!(plant.asked_by("cell-2", shadow).unwrap(), "2");
+    // A function of a trigger serves no table of a member.
+    let triggered = "CREATE TEMP TABLE t (id int, cell int, name text, recipe text, simulation boolean, ended timestamptz, result text, cycles int);
+        CREATE TRIGGER t AFTER INSERT ON t REFERENCING NEW TABLE AS new_run FOR EACH STATEMENT EXECUTE FUNCTION regrind.runs_changed();
+        INSERT INTO t VALUES (1, 1, 'n', 'r', false, now(), 'not accepted', 1)";
+    assert!(plant.asked_by("cell-2", triggered).unwrap_err().contains("permission denied"));
+    plant.sql("REVOKE TEMPORARY ON DATABASE regrind FROM cell_2");
+    let open = "SELECT string_agg(p.oid::regprocedure::text, ', ') FROM pg_proc p WHERE p.pronamespace = 'regrind'::regnamespace
+        AND has_function_privilege('public', p.oid, 'EXECUTE')";
+    assert_eq!(plant.sql(open), "", "everybody may execute these");
     // Nobody else can sign in.
     assert!(plant.postgres.ask_as("cell_2", "wrong", "regrind", "SELECT 1").is_err());
     plant.does(&["plant", "retire", "cell-2", "--plant", "owner.toml"]);

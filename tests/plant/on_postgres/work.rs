@@ -375,7 +375,8 @@ fn wrong_name_of_signer_is_replaced() {
     assert_eq!(queue(), 2, "two keys, and one name");
     assert_eq!(sign("Bob", "Bob", &[]), 2);
     assert_eq!(sign("Bob", "Bob", &["--replace"]), 0);
-    assert_eq!(plant.sql("SELECT earlier_names FROM approval WHERE person = 'Bob' AND earlier_names <> '{}'"), "{Ada}");
+    assert_eq!(plant.sql("SELECT person || ' ' || length(signature) FROM approval_replaced"), "Ada 128");
+    assert_eq!(plant.sql("SELECT count(*) FROM incident WHERE what = 'a signature replaced'"), "1");
     assert_eq!(queue(), 0);
     plant.does(&["work", "--plant", "cell-1.toml", "--part", "SN-1", "--once"]);
 }
@@ -405,6 +406,9 @@ fn withdrawn_recipe_can_come_back() {
     let states = "SELECT string_agg(serial || ' ' || state, ', ' ORDER BY id) FROM work";
     assert_eq!(plant.sql(states), "SN-1 begun, SN-2 withdrawn, SN-3 withdrawn");
     assert_eq!(plant.sql("SELECT count(*) FROM work_step WHERE step = 'withdrawn'"), "2");
+    // One that is given back now would wait for ever.
+    assert_eq!(plant.asked_by("cell-1", "SELECT give_back_work(1, 'run-1', 'why')").unwrap(), "");
+    assert_eq!(plant.sql("SELECT state FROM work WHERE id = 1"), "withdrawn");
 
     plant.does(&["plant", "propose", "small.toml", "--plant", "planner.toml"]);
     assert_eq!(plant_queue(&plant, "SN-2", "small"), 2, "the earlier signatures do not count");
