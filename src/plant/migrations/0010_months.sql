@@ -55,7 +55,7 @@ END $$;
 -- Makes the next block, for a month, with the sequence that gives its numbers: no cell waits for another one. Two million runs in a month are
 -- two thousand cells that make a part in three quarters of an hour.
 CREATE FUNCTION make_block(of_month date) RETURNS void
-LANGUAGE plpgsql SET search_path = regrind, pg_temp SET lock_timeout = '5s' AS $$
+LANGUAGE plpgsql SET search_path = regrind, pg_temp SET lock_timeout = '500ms' AS $$
 DECLARE
     begins integer;
     ends integer;
@@ -224,15 +224,15 @@ BEGIN
         RETURN 0;
     END IF;
     -- A run of which no record ever came is none. It begins anew if one comes.
-    DELETE FROM cycle y USING run r WHERE y.run = r.id AND r.id >= b.first AND r.id < b.behind AND r.records = 0 AND is_past;
-    DELETE FROM run r WHERE r.id >= b.first AND r.id < b.behind AND r.records = 0 AND is_past;
+    DELETE FROM cycle y USING run r WHERE y.run = r.id AND r.id >= b.first AND r.id < b.behind AND r.records = 0 AND r.began IS NULL AND is_past;
+    DELETE FROM run r WHERE r.id >= b.first AND r.id < b.behind AND r.records = 0 AND r.began IS NULL AND is_past;
     UPDATE run r SET numbering = jsonb_build_object('payload', jsonb_build_object('content', jsonb_build_object(
             'number', e.text::jsonb #> '{payload,content,number}', 'before', e.text::jsonb #> '{payload,content,before}')))::text
         FROM record e WHERE e.run = r.id AND e.seq = 1 AND e.run >= b.first AND e.run < b.behind
             AND r.id >= b.first AND r.id < b.behind AND r.archived_at IS NOT NULL AND r.numbering IS NULL;
     INSERT INTO archived_content SELECT DISTINCT a.sha256 FROM run_artefact a JOIN run r ON r.id = a.run
         WHERE a.run >= b.first AND a.run < b.behind AND r.archived_at IS NOT NULL ON CONFLICT DO NOTHING;
-    IF is_past AND NOT EXISTS (SELECT FROM run r WHERE r.id >= b.first AND r.id < b.behind AND r.archived_at IS NULL) THEN
+    IF is_past AND NOT EXISTS (SELECT FROM run r WHERE r.id >= b.first AND r.id < b.behind AND r.archived_at IS NULL AND r.records > 0) THEN
         gone := (SELECT count(*) FROM record e WHERE e.run >= b.first AND e.run < b.behind);
         EXECUTE (SELECT coalesce(string_agg(format('DROP TABLE %s;', i.inhrelid::regclass), ' ' ORDER BY i.inhparent DESC), '')
             FROM pg_inherits i JOIN pg_class p ON p.oid = i.inhrelid
