@@ -41,6 +41,14 @@ impl PublishingCell {
         Running::new(regrind(&["tell", "--plant", "plant.toml", "--json"], self.home.path()))
     }
 
+    /// Lets the broker go on. The host listens before the node is back: whoever subscribes late misses its birth.
+    fn mend(&mut self, teller: &mut Running, from: usize) {
+        teller.signal("STOP");
+        self.broker.go_on();
+        listens(&mut self.host, from);
+        teller.signal("CONT");
+    }
+
     /// Kills the broker, as a loss of power does, and waits until both ends know it.
     fn cut(&mut self, teller: &mut Running) -> usize {
         let from = self.host.place();
@@ -441,8 +449,7 @@ fn sparkplug_oldest_changes_dropped() {
     assert_eq!(code, 0, "{out}{errors}");
     running.end();
     cell.until_kept(&mut teller, "\"Stopped\"");
-    cell.broker.go_on();
-    listens(&mut cell.host, from);
+    cell.mend(&mut teller, from);
     cell.host.until(from, "the end", |said| {
         said.iter().any(|line| line["history"]["Last Run/Result"] == "Stopped").then_some(())
     });
