@@ -75,7 +75,7 @@ pub async fn archive_runs(
             match archive_run(link, artefacts, folder, &run).await {
                 Ok(None) => result.runs += 1,
                 Ok(Some(reason)) => result.kept.push((format!("{} of {}", run.name, run.cell), reason)),
-                // What is wrong with one copy must not keep the others here.
+                // A wrong copy must not keep the others in the database.
                 Err(error @ (PlantError::Journal(_) | PlantError::Differs { .. })) => {
                     result.kept.push((format!("{} of {}", run.name, run.cell), error.to_string()));
                 }

@@ -291,6 +291,24 @@ mod tests {
     use super::MIGRATIONS;
     use regrind_formats::run_files::RunFile;
 
+    /// A database names the hash of each script that made it: a script that was published keeps every byte.
+    #[test]
+    fn published_migrations_are_unchanged() {
+        let published = [
+            "8edafe1caaad074088738da0afae3b84541f356c1b791cd2ff504ee3dc941d28",
+            "9ce8793c42b61a06505809ddd6e8968c4757643ac623a747265e8c7f79703f98",
+            "5cf97c13d4a9e726dbbd3b0da4131420647542ea6126dfbd7f8d5d175006da9f",
+            "602439e08e5842bd68a52893d3690ef6416772956a34576ab88c858277606a9b",
+            "2906050ef4bd722502107c1b28ec71b3291695e8a2fce3d42cd34cede06862c3",
+            "2c57ee011b6fe64810a8b69752e14ce4bafae8fa721647b4fcc82c8abc779525",
+            "ee139ae30be641061b84910364560728186072743559e0e172d25955ddbc5463",
+            "ac9dcd30068d60910300bd350c55ce73d263f4dd85cd93aaa56940b34875dadd",
+        ];
+        for ((version, text), sha256) in MIGRATIONS.iter().zip(published) {
+            assert_eq!(regrind_journal::sha256_hex(text.as_bytes()), sha256, "migration {version}");
+        }
+    }
+
     #[test]
     fn migration_names_learned_file() {
         let name = format!("a.name = '{}'", RunFile::Learned.name());

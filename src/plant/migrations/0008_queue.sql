@@ -15,7 +15,7 @@ BEGIN
         RAISE EXCEPTION 'this cell has % parts leased that it has not begun', most
             USING ERRCODE = 'insufficient_privilege', HINT = 'begin them, give them back, or wait until the leases end';
     END IF;
-    -- A part that this cell has refused comes last. It is tried again, for its recipe can be signed meanwhile.
+    -- What this cell has refused comes last: it is tried again, for its recipe can be signed meanwhile.
     SELECT * INTO found FROM work w
         WHERE (w.state = 'open' OR (w.state = 'leased' AND w.leased_until < now()))
             AND (w.for_cell IS NULL OR w.for_cell = mine) AND is_approved(w.recipe)

@@ -973,7 +973,7 @@ fn filled_plant_is_proven_and_every_query_has_an_index() {
     assert!(told.contains("another seed"), "{told}");
     does(fill("--runs 4000 --seed 8"));
     assert_ne!(plant.sql(drawn), first);
-    // Whatever exists beside these runs, no page reads the whole table of runs: a few real ones of one cell.
+    // No page reads the whole table of runs, also with a few real runs of one cell beside the simulated ones.
     let real = cell(&plant, "cell-1");
     plant_runs(
         &plant,
