@@ -20,11 +20,11 @@ WITH place AS (
     SELECT r.*, m.first + row_number() OVER (PARTITION BY m.at ORDER BY n) - 1 AS id
     FROM result r JOIN month m ON m.at = date_trunc('month', r.began AT TIME ZONE 'UTC') AT TIME ZONE 'UTC'
 ), made AS (
-    INSERT INTO run (id, cell, name, part, part_name, recipe, recipe_sha256, operator, simulation, began, ended, result, verdict, pv_limit_um, rms_limit_um, grinder,
+    INSERT INTO run (id, cell, name, part, part_name, recipe, recipe_sha256, operator, simulation, began, ended, arrived_at, result, verdict, pv_limit_um, rms_limit_um, grinder,
         cmm, wheel, probe, alarms, cycles, pv_um, pv_u_um, rms_um, rms_u_um)
     SELECT id, cell, 'SIMULATION-' || $7::bigint || '-' || lpad(n::text, 8, '0'), 'SIMULATION-' || lpad(n::text, 8, '0'), 'Free-form mirror ' || recipe_number,
         'mirror-' || recipe_number, encode(sha256(convert_to('mirror-' || recipe_number, 'UTF8')), 'hex'), 'Operator ' || n % 70, true, began,
-        CASE WHEN result <> 'open' THEN began + lasts END, result,
+        CASE WHEN result <> 'open' THEN began + lasts END, began + lasts, result,
         CASE result WHEN 'accepted' THEN 'ACCEPTED: PV and RMS within tolerance' WHEN 'open' THEN NULL ELSE upper(result) || ': simulated' END, 7, 1,
         'Grinder ' || lpad(cell_number::text, 4, '0'), 'CMM ' || cell_number / 5, 'R ' || 18 + (cell_number + extract(epoch FROM began)::bigint / 2592000) % 4 || '.000 mm',
         'R ' || 1 + cell_number % 3 || '.500 mm', (ending > 0.96)::integer, cycles, pv_um, 0.4, pv_um / 8, 0.03

@@ -17,7 +17,7 @@ WITH whole AS (
         = (excluded.verdict, excluded.reason, excluded.pv_um, excluded.pv_u_um, excluded.rms_um, excluded.rms_u_um,
            excluded.expected_pv_um, excluded.expected_rms_um, excluded.map)
 )
-UPDATE run r SET records = t.records, head = t.head, operator = t.begin ->> 'actor', began = (t.begin ->> 'utc')::timestamptz, ended = t.ended::timestamptz,
+UPDATE run r SET records = t.records, head = t.head, operator = t.begin ->> 'actor', began = (t.begin ->> 'utc')::timestamptz, ended = t.ended::timestamptz, arrived_at = t.ended::timestamptz,
     part_name = t.content ->> 'part_name', recipe_sha256 = t.content ->> 'recipe_sha256',
     recipe = regexp_replace(t.content ->> 'recipe', '^.*[/\\]|\.toml$', '', 'g'), result = t.told ->> 'result', verdict = t.told ->> 'verdict',
     pv_limit_um = (t.told ->> 'pv_limit_um')::double precision, rms_limit_um = (t.told ->> 'rms_limit_um')::double precision, grinder = t.told ->> 'grinder',
