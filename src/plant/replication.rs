@@ -193,8 +193,9 @@ impl Replicator {
     }
 
     /// Asks the plant once which runs of this cell it has as a whole: ended, with all files, with their result, and with
-    /// what they have learned. Those runs are not read again if the last record of their journal is the last one that the
-    /// plant has. Forgets all that was known about the runs before.
+    /// what they have learned. A run whose end is not signed with a key of the cell teaches nothing, so no lesson of it is
+    /// missed. Those runs are not read again if the last record of their journal is the last one that the plant has.
+    /// Forgets all that was known about the runs before.
     ///
     /// Returns an error if the plant cannot be reached.
     async fn compare_with_plant(&mut self, link: &DatabaseLink) -> Result<(), PlantError> {
@@ -205,7 +206,9 @@ impl Replicator {
             AND NOT EXISTS (SELECT FROM run_artefact a WHERE a.run = r.id
                 AND NOT EXISTS (SELECT FROM artefact_of o WHERE o.cell = r.cell AND o.sha256 = a.sha256))
             AND NOT EXISTS (SELECT FROM run_artefact a WHERE a.run = r.id AND a.name = $1
-                AND NOT EXISTS (SELECT FROM lesson l WHERE l.run = r.id))";
+                AND NOT EXISTS (SELECT FROM lesson l WHERE l.run = r.id)
+                AND EXISTS (SELECT FROM record e JOIN cell_key k ON k.cell = r.cell WHERE e.run = r.id AND e.seq = r.records
+                    AND e.text::json ->> 'kind' = 'seal' AND e.text::json -> 'payload' ->> 'key' = k.key))";
         let rows = link.client().query(text, &[&RunFile::Learned.name()]).await;
         for row in rows.map_err(refused("the query of the runs of this cell"))? {
             let (name, records, head): (String, i32, &[u8]) = (row.get(0), row.get(1), row.get(2));

@@ -303,6 +303,9 @@ mod tests {
             "2c57ee011b6fe64810a8b69752e14ce4bafae8fa721647b4fcc82c8abc779525",
             "ee139ae30be641061b84910364560728186072743559e0e172d25955ddbc5463",
             "ac9dcd30068d60910300bd350c55ce73d263f4dd85cd93aaa56940b34875dadd",
+            "21d3b552cf46f2275d50647c1817a48a823ca1f4e4a74de8e19d1a32d3ffcda0",
+            "408a9f3a040dc3aee8451d8d91dbcc5519b07624d0ed2c0f5e6953a46d9cdba2",
+            "9309271c50855a2e0fd942a4134fda052158bb6bcee9a3bf356714ec359a5753",
         ];
         for ((version, text), sha256) in MIGRATIONS.iter().zip(published) {
             assert_eq!(regrind_journal::sha256_hex(text.as_bytes()), sha256, "migration {version}");
