@@ -621,6 +621,11 @@ mod tests {
         map.save_svg(&folder.path().join("a.svg")).unwrap();
         map.save_png(&folder.path().join("a.png")).unwrap();
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
+        // The map is in the picture, not only its scale, which has 2 % of the pixels.
+        let (_, pixels) = decoded(&std::fs::read(folder.path().join("a.png")).unwrap());
+        let is_coloured = |p: &[u8]| p[0].abs_diff(p[1]).max(p[1].abs_diff(p[2])) > 40;
+        let coloured = pixels.chunks_exact(4).filter(|pixel| is_coloured(pixel)).count();
+        assert!(coloured > pixels.len() / 4 / 10, "{coloured} of {} pixels", pixels.len() / 4);
         let error = map.save_png(&folder.path().join("none/a.png")).unwrap_err();
         assert!(matches!(error, ReportError::File(_)), "{error}");
     }

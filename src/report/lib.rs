@@ -136,6 +136,11 @@ pub enum ReportError {
     File(#[from] FormatError),
 }
 
+/// Returns the present time in UTC, RFC 3339, to the second.
+pub fn now() -> String {
+    regrind_journal::utc_to_the_second(std::time::SystemTime::now())
+}
+
 /// Returns the present day in UTC, `2026-07-04`.
 pub fn today() -> String {
     let mut now = regrind_journal::utc(std::time::SystemTime::now());
