@@ -59,7 +59,7 @@ struct Good {
 
 /// One problem, as JSON.
 #[derive(Serialize)]
-struct ProblemDocument {
+pub(super) struct ProblemDocument {
     line: usize,
     column: usize,
     key: String,
@@ -102,9 +102,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         }
         let (sha256, problems) = match &checked {
             Ok(good) => (Some(good.sha256.clone()), Vec::new()),
-            Err(problems) => {
-                (None, problems.problems.iter().map(|problem| ProblemDocument::new(problems, problem)).collect())
-            }
+            Err(problems) => (None, ProblemDocument::all(problems)),
         };
         let notes = checked.as_ref().map_or(Vec::new(), |good| good.notes.clone());
         found.push(CheckedFile { file: path.clone(), kind, good: checked.is_ok(), sha256, notes, problems });
@@ -141,12 +139,17 @@ fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
         let good = |cell: CellConfig| Good { sha256: HEXLOWER.encode(cell.source_sha256()), notes: cell_notes(&cell) };
         return ("cell file", CellConfig::read(path).map(good));
     }
-    let checked = Recipe::read(path).and_then(|recipe| {
-        check_files(&recipe)?;
-        check_simulation(&recipe)?;
-        Ok(Good { sha256: HEXLOWER.encode(recipe.source_sha256()), notes: recipe.notes().to_vec() })
-    });
-    ("recipe", checked)
+    let good =
+        |recipe: Recipe| Good { sha256: HEXLOWER.encode(recipe.source_sha256()), notes: recipe.notes().to_vec() };
+    ("recipe", Recipe::read(path).and_then(with_good_files).map(good))
+}
+
+/// Returns `recipe` if the files that it names and its table `[simulation]` have no problem. Otherwise returns the
+/// problems.
+pub(super) fn with_good_files(recipe: Recipe) -> Result<Recipe, Problems> {
+    check_files(&recipe)?;
+    check_simulation(&recipe)?;
+    Ok(recipe)
 }
 
 /// Returns the notes of a cell file, with a note for each machine whose calibration is overdue today.
@@ -261,6 +264,11 @@ impl ProblemDocument {
     fn of_file(found: String) -> Self {
         let none = String::new;
         Self { line: 1, column: 1, key: none(), found, allowed: none(), remedy: none() }
+    }
+
+    /// Returns the documents of all `problems`.
+    pub(super) fn all(problems: &Problems) -> Vec<Self> {
+        problems.problems.iter().map(|problem| Self::new(problems, problem)).collect()
     }
 
     fn new(problems: &Problems, problem: &Problem) -> Self {

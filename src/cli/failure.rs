@@ -97,6 +97,8 @@ pub(super) enum Failure {
     ControlSocket { path: PathBuf, source: io::Error },
     #[error("{path}: this path contains no run; name the folder of a run")]
     NoRun { path: PathBuf },
+    #[error("{}: there is no such folder of recipes; create it, or name another one with --recipes", .path.display())]
+    NoRecipesFolder { path: PathBuf },
     #[error(
         "{}: this folder does not exist; give the folder of the runs, or create it: mkdir {0}", .path.display()
     )]
@@ -167,6 +169,8 @@ pub(super) enum Failure {
         .cell.display()
     )]
     NoRehearsal { cell: PathBuf },
+    #[error("{}: a draft of a recipe runs on simulated machines only, and this cell has others; use the built-in cell `sim`", .cell.display())]
+    DraftNeedsSimulation { cell: PathBuf },
     #[error("{}: the simulated machines ended with the program of this run, so the run cannot be resumed; begin a new run", .run.display())]
     WorldGone { run: PathBuf },
     #[error(

@@ -9,6 +9,7 @@ mod compensate;
 mod completeness;
 mod control;
 mod doctor;
+mod draft;
 mod face_list;
 mod failure;
 mod file_kind;
@@ -48,6 +49,7 @@ mod watch;
 #[cfg(not(feature = "plant"))]
 mod without_plant;
 mod words;
+mod workbench;
 
 use std::io::{self, Write};
 use std::process::ExitCode;
@@ -59,7 +61,7 @@ use parsers::{above_zero, finite_above_zero, finite_from_zero, name, remark};
 use regrind::document::{countable, visible};
 use regrind::drive::Request;
 use runtime::runtime;
-use terminal::{print, print_json};
+use terminal::{print, print_json, print_json_line};
 #[cfg(not(feature = "plant"))]
 use without_plant as plant;
 
@@ -76,6 +78,8 @@ enum Command {
     Init(init::Arguments),
     Run(run::Arguments),
     Plan(plan::Arguments),
+    #[command(hide = true)]
+    Draft(draft::Arguments),
     Simulate(simulate::Arguments),
     /// Hold a running cell at the next safe place
     #[command(after_help = control::help("regrind hold --reason \"coolant looks low\""))]
@@ -138,6 +142,7 @@ fn run() -> ExitCode {
         Command::Init(arguments) => init::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
         Command::Plan(arguments) => plan::run(&arguments),
+        Command::Draft(arguments) => draft::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Hold(arguments) => control::order(&arguments, |reason| Request::Hold { reason, state_number: None }),
         Command::Resume(arguments) => resume::run(&arguments),

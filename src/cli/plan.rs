@@ -7,10 +7,11 @@ use data_encoding::HEXLOWER;
 use regrind::cell::CellPlan;
 use regrind::compensation::path::{ArcSummary, PathSummary, Peak, Scallops, ToolPath};
 use regrind::config::{BUILT_IN_CELL, CellConfig};
-use regrind::drive::{Task, forecast_refusal};
+use regrind::drive::{MeasurementForecast, Task, forecast_measurement};
 use regrind::formats::gcode::GcodeError;
 use regrind::model::FIRST_BATCH;
 use regrind::recipe::{NominalSource, Recipe};
+use regrind::registration::WeakDirection;
 use regrind::setup::{self, MAX_SCALLOP_SHARE};
 use serde::Serialize;
 
@@ -51,15 +52,12 @@ const PV_OF_RMS: f64 = 6.0;
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let recipe = or_show(Recipe::read(&arguments.recipe))?;
     let cell = or_show(CellConfig::read(&arguments.cell))?;
-    let (task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
-    let program = first_path(&task, &recipe, &cell)?;
-    let arcs = arcs_of(&task, program.as_ref())?;
+    let PlannedRun { document, task, .. } = PlannedRun::new(&recipe, &cell)?;
     if let Some(file) = &arguments.program {
         let first = task.first_correction();
         let programs = task.programs.as_ref().map_err(|error| Failure::Programs(error.clone().into()))?;
         programs.write(file, &first, task.map_identity(&first)).map_err(Failure::Programs)?;
     }
-    let document = Document::new((&recipe, &cell), (&task, &plan), program.as_ref(), arcs);
     if arguments.json {
         super::print_json(&document)?;
     } else {
@@ -68,8 +66,32 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
+/// Plan of a run.
+pub(super) struct PlannedRun {
+    /// The plan for people and programs.
+    pub(super) document: PlanDocument,
+    /// Task of the run.
+    pub(super) task: Task,
+    /// Path of the first pass with its summary; `None` if this program cannot plan a path for the part.
+    pub(super) path: Option<(ToolPath, PathSummary)>,
+}
+
+impl PlannedRun {
+    /// Plans a run of `recipe` in `cell`.
+    ///
+    /// # Errors
+    /// The recipe and the cell do not fit together, the wheel cannot grind the surface, or a limit is exceeded.
+    pub(super) fn new(recipe: &Recipe, cell: &CellConfig) -> Result<Self, Failure> {
+        let (task, plan) = setup::prepare(recipe, cell).map_err(Failure::Setup)?;
+        let path = first_path(&task, recipe, cell)?;
+        let arcs = arcs_of(&task, path.as_ref())?;
+        let document = PlanDocument::new((recipe, cell), (&task, &plan), path.as_ref(), arcs);
+        Ok(Self { document, task, path })
+    }
+}
+
 #[derive(Serialize)]
-struct Document {
+pub(super) struct PlanDocument {
     simulation: bool,
     part: String,
     part_identity: String,
@@ -107,6 +129,9 @@ struct Document {
     /// Hours of all passes, plus the minimum duration of all measurements.
     #[serde(rename = "least_hours_to_last")]
     min_hours_total: f64,
+    /// Directions in which the shape of the part determines its position poorly, as a measurement after the first pass
+    /// would tell.
+    weak_directions: Vec<WeakDirection>,
     /// Warnings to read before the run.
     warnings: Vec<String>,
     /// Number of points in the program of one pass; absent if no program can be made.
@@ -277,7 +302,7 @@ impl ScallopsDocument {
     }
 }
 
-impl Document {
+impl PlanDocument {
     /// Describes the plan `plan` of the run with the task `task`. `program` is the path of the first pass with its
     /// summary, if there is one, and `arcs` describes its arcs.
     fn new(
@@ -294,6 +319,7 @@ impl Document {
         let grinding_minutes = path_mm / task.pass.feed_mm_min;
         let removed_mm3_a_pass = pass_mm * task.pass.track_spacing_mm * task.correction_limits.depth_of_cut_mm;
         let max_measurements = plan.max_cycle_number();
+        let forecast = forecast(task, recipe);
         let min_measuring_minutes = min_measuring_minutes(task);
         let min_minutes = f64::from(plan.max_cycles) * grinding_minutes
             + f64::from(max_measurements) * min_measuring_minutes.unwrap_or(0.0);
@@ -321,11 +347,12 @@ impl Document {
             max_measurements,
             min_measuring_minutes,
             min_hours_total: min_minutes / 60.0,
+            weak_directions: forecast.measurement.weak_directions.clone(),
             warnings: warnings(task, path_mm, grinding_minutes, min_measuring_minutes)
                 .into_iter()
                 .chain(warning_of_scallops(task, recipe))
                 .chain(warning_of_unit(task, recipe))
-                .chain(warning_of_refusal(task, recipe))
+                .chain(forecast.warning())
                 .collect(),
             program_points: program.map(|(_, summary)| summary.points),
             arcs,
@@ -436,24 +463,43 @@ fn warning_of_unit(task: &Task, recipe: &Recipe) -> Option<String> {
     })
 }
 
-/// Returns a warning if a measurement of this part would end without a correction, because the shape of the part does
-/// not determine its position well enough. The measurement is computed for a form error of [`FORM_ERROR_LIMITS`] times
-/// the limits of the part, as a first pass leaves it.
-fn warning_of_refusal(task: &Task, recipe: &Recipe) -> Option<String> {
+/// Forecast of the measurement after the first pass.
+struct FirstMeasurement {
+    /// Form error that is expected after the first pass, rms in millimetres.
+    rms_mm: f64,
+    measurement: MeasurementForecast,
+}
+
+impl FirstMeasurement {
+    /// Returns a warning if the measurement would end without a correction, because the shape of the part does not
+    /// determine its position well enough.
+    fn warning(&self) -> Option<String> {
+        let reason = self.measurement.refusal.as_ref()?;
+        Some(format!(
+            "a measurement of a part with {} µm rms of form error may end without a correction: {reason}",
+            three_digits(1e3 * self.rms_mm)
+        ))
+    }
+}
+
+/// Returns the forecast of the measurement after the first pass. The form error is [`FORM_ERROR_LIMITS`] times the
+/// limits of the part, as a first pass leaves it. The forecast is empty if the recipe has no limit, or if the operator
+/// chooses the points.
+fn forecast(task: &Task, recipe: &Recipe) -> FirstMeasurement {
     let [pv_mm, rms_mm] =
         [recipe.acceptance.pv_um.map(|um| um.mm() / PV_OF_RMS), recipe.acceptance.rms_um.map(|um| um.mm())];
     let rms_mm = FORM_ERROR_LIMITS * rms_mm.into_iter().chain(pv_mm).fold(f64::INFINITY, f64::min);
-    let reason = (rms_mm.is_finite() && !task.targets.is_empty()).then(|| forecast_refusal(task, rms_mm))??;
-    Some(format!(
-        "a measurement of a part with {} µm rms of form error may end without a correction: {reason}",
-        three_digits(1e3 * rms_mm)
-    ))
+    let measurement = match rms_mm.is_finite() && !task.targets.is_empty() {
+        true => forecast_measurement(task, rms_mm),
+        false => MeasurementForecast::default(),
+    };
+    FirstMeasurement { rms_mm, measurement }
 }
 
 /// Returns the estimated duration of the planned run as text for a person. The text states the grinding time of each
 /// pass in minutes, the minimum time of each measurement in minutes, and the sum in hours. The sum assumes that all
 /// allowed passes are needed.
-fn time_in_words(d: &Document) -> String {
+fn time_in_words(d: &PlanDocument) -> String {
     let n = three_digits;
     let measurements = counted(d.max_measurements as usize, "measurement");
     let measuring = d.min_measuring_minutes.map_or("of unknown duration".to_owned(), |minutes| {
@@ -471,7 +517,7 @@ fn time_in_words(d: &Document) -> String {
 /// Returns the removed volumes as text for a person, in mm3: the volume that one pass removes from the part, and the
 /// volume that the wheel loses in one pass and in all allowed passes. If the loss of the wheel is unknown, the text
 /// says so.
-fn removal_in_words(d: &Document) -> String {
+fn removal_in_words(d: &PlanDocument) -> String {
     let n = three_digits;
     let most = f64::from(d.max_passes);
     let wheel = match d.wheel_loss_mm3_a_pass {
@@ -495,7 +541,7 @@ pub(super) fn first_path(
     task.first_path().map_err(|source| Failure::FirstPath { recipe, cell, source })
 }
 
-fn words(d: &Document) -> String {
+fn words(d: &PlanDocument) -> String {
     let n = three_digits;
     let marked = if d.simulation { "SIMULATION  " } else { "" };
     let program = match (d.program_points, &d.no_program) {
@@ -510,10 +556,11 @@ fn words(d: &Document) -> String {
         ""
     };
     let tilt = d.tilt.as_ref().map_or(String::new(), TiltDocument::in_words);
+    let weak: String = d.weak_directions.iter().map(|weak| format!("weak        {}\n", weak.description)).collect();
     let warnings: String = d.warnings.iter().map(|warning| format!("warning     {warning}\n")).collect();
     format!(
         "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nscallops    {}\nprogram     {program}\n{arcs}{tilt}{learns}\
-         level       {} µm over the nominal surface in the first pass, at least {} µm deeper in each further pass, {} µm in the last (negative: below the surface)\nbudget      {} µm of material in all passes\nremoval     {}\ncycles      at most {}\ntime        {}\n{warnings}",
+         level       {} µm over the nominal surface in the first pass, at least {} µm deeper in each further pass, {} µm in the last (negative: below the surface)\nbudget      {} µm of material in all passes\nremoval     {}\ncycles      at most {}\ntime        {}\n{weak}{warnings}",
         d.part,
         counted(d.nominal_points, "point"),
         d.part_identity,

@@ -9,7 +9,7 @@ use clap::Args;
 use data_encoding::HEXLOWER;
 use regrind::cell::{Actor, CellPlan, Ending, FirstStep, TABLE_VERSION};
 use regrind::config::{BUILT_IN_CELL, CellConfig};
-use regrind::document::visible;
+use regrind::document::{Problems, read_text, visible};
 use regrind::drive::Task;
 use regrind::formats::run_files::{CycleFolder, RunFile};
 use regrind::formats::{KnowledgeOrigin, Learned, LearnedError, SettingIdentity};
@@ -67,6 +67,10 @@ pub(super) struct Arguments {
     /// after the run until Ctrl-C
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = serve::ADDRESS)]
     pub(super) serve: Option<SocketAddr>,
+    /// Read the text of the recipe from this file, as if it were that of RECIPE; only simulated machines are used, at the
+    /// lowest priority
+    #[arg(long, value_name = "FILE", hide = true)]
+    pub(super) draft: Option<PathBuf>,
     #[command(flatten)]
     pub(super) plant: plant::RunArguments,
     /// Print a line of JSON for each event
@@ -75,8 +79,14 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let recipe = check::or_show(Recipe::read(&arguments.recipe))?;
+    let recipe = check::or_show(read_recipe(arguments))?;
     let mut cell = check::or_show(CellConfig::read(&arguments.cell))?;
+    if arguments.draft.is_some() {
+        if !within(&cell) {
+            return Err(Failure::DraftNeedsSimulation { cell: arguments.cell.clone() });
+        }
+        outside::give_way(outside::LOWEST_STEPS);
+    }
     let of_cell: Vec<String> =
         cell.renamed_keys().iter().cloned().chain(cell.calibration_notes(&regrind::report::today())).collect();
     for (path, notes) in [(&arguments.recipe, recipe.notes()), (&arguments.cell, &of_cell[..])] {
@@ -126,6 +136,14 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         }
         outcome(&ending)
     })
+}
+
+/// Reads the recipe of a run, or the text that is to be tried in its place.
+fn read_recipe(arguments: &Arguments) -> Result<Recipe, Problems> {
+    match &arguments.draft {
+        None => Recipe::read(&arguments.recipe),
+        Some(draft) => Recipe::parse(&arguments.recipe, &read_text(draft)?),
+    }
 }
 
 /// Returns the folder of a run in `runs` that accepted the part with the serial number `part`, the last by name.

@@ -81,7 +81,7 @@ fn recipe_and_cell(run: &Path) -> Option<(Recipe, CellConfig)> {
 fn plan(run: &Path) -> Option<Planned> {
     let (recipe, cell) = recipe_and_cell(run)?;
     let (task, _) = setup::prepare(&recipe, &cell).ok()?;
-    let path = task.first_path().ok().flatten().map(|(path, _)| picture(&path));
+    let path = task.first_path().ok().flatten().map(|(path, _)| path_picture(&path));
     let points = task.targets.iter().map(|target| [target.point.x, target.point.y]).collect();
     Some(Planned { points, path })
 }
@@ -97,7 +97,7 @@ fn wheel_radius_mm(wheel: &WheelDimensions) -> Option<f64> {
 /// Returns the path of the wheel as a line for people: its corners, and the points at which it has bent by
 /// [`BEND_RAD`]. Each point is x and y in mm and the share of the length at feed up to it. A point that is not finite
 /// begins a new track.
-fn picture(path: &ToolPath) -> Vec<[f64; 3]> {
+pub(super) fn path_picture(path: &ToolPath) -> Vec<[f64; 3]> {
     let mut corners: Vec<[f64; 3]> = Vec::new();
     let (mut length_mm, mut last, mut heading) = (0.0, None::<[f64; 3]>, None::<f64>);
     for step in path.moves() {

@@ -7,6 +7,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use clap::Args;
+use regrind::config::BUILT_IN_CELL;
 use regrind_page::{Entrance, Page, Tls, UsersFile, Viewers};
 use tokio::net::TcpListener;
 
@@ -14,6 +15,7 @@ use super::Outcome;
 use super::failure::Failure;
 use super::outside::Endings;
 use super::run_plan::RunPlans;
+use super::workbench::workbench;
 
 /// Default address of the page.
 pub(super) const ADDRESS: &str = "127.0.0.1:7373";
@@ -44,6 +46,12 @@ pub(super) struct Arguments {
     /// Address and port of the page; port 0 selects a free port
     #[arg(long, value_name = "ADDRESS", default_value = ADDRESS)]
     listen: SocketAddr,
+    /// Folder of the recipes that an engineer writes on the page; `recipes` if it exists
+    #[arg(long, value_name = "DIR")]
+    recipes: Option<PathBuf>,
+    /// Cell for which recipes are planned; `sim` is the built-in simulated cell
+    #[arg(long, value_name = "FILE", default_value = BUILT_IN_CELL)]
+    cell: PathBuf,
     #[command(flatten)]
     door: PageAccess,
     /// End after the end of standard input, that is, after the end of the program that started this one
@@ -89,7 +97,8 @@ impl PageAccess {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let Arguments { runs, listen, door, while_stdin, first_run } = arguments;
+    let Arguments { runs, listen, recipes, cell, door, while_stdin, first_run } = arguments;
+    let workbench = workbench(recipes.as_deref(), cell)?;
     super::runtime()?.block_on(async {
         let (listener, entrance) = door.open(*listen).await?;
         if !runs.is_dir() {
@@ -102,7 +111,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             Box::new(RunPlans::default()),
             Box::new(|what| eprintln!("page: {what}")),
         );
-        let page = page.map_err(taken)?.with_first_run(first_run.clone());
+        let page = page.map_err(taken)?.with_first_run(first_run.clone()).with_workbench(workbench);
         let viewers = page.viewers();
         super::print(&format!("page     {}\n", page.url()))?;
         tokio::select! {

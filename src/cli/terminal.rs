@@ -24,6 +24,12 @@ pub(super) fn print_json(value: &impl serde::Serialize) -> Result<(), Failure> {
     print(&(coded(&text) + "\n"))
 }
 
+/// Writes a value to the terminal as one line of JSON.
+pub(super) fn print_json_line(value: &impl serde::Serialize) -> Result<(), Failure> {
+    let text = serde_json::to_string(value).map_err(|e| Failure::Terminal(e.into()))?;
+    print(&(coded(&text) + "\n"))
+}
+
 /// Returns JSON with each invisible or misleading character replaced by its code. Line feeds stay: within a text of JSON
 /// there is none.
 fn coded(json: &str) -> String {

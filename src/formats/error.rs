@@ -17,6 +17,18 @@ pub enum FormatError {
     /// The file could not be opened or read.
     #[error("{path}: cannot be read: {source}; check the name and the permissions")]
     Unreadable { path: PathBuf, source: io::Error },
+    /// The name of a recipe is not plain.
+    #[error(
+        "`{}` is no name for a recipe; write letters, digits, spaces, `-` or `_`, at most 95 bytes, and `.toml` at the end",
+        name.escape_debug()
+    )]
+    RecipeName { name: String },
+    /// A recipe that another person or program has changed since it was read.
+    #[error("{path}: the file was changed meanwhile; compare your text with the present one, then save again")]
+    ChangedMeanwhile { path: PathBuf },
+    /// A saved version that differs from its description.
+    #[error("{path}: this saved version was changed; take another version, or restore the file from a backup")]
+    ChangedVersion { path: PathBuf },
     /// The file has more bytes, points or triangles (`unit` says which) than are read.
     #[error("{path}: the file has {found} {unit}, more than the limit of {limit}; reduce or split the file")]
     TooLarge { path: PathBuf, found: u64, limit: u64, unit: &'static str },

@@ -35,14 +35,16 @@ mod persistent_counter;
 pub mod ply;
 pub mod points;
 mod qif;
+pub mod recipe_folder;
 pub mod references;
-pub mod registration;
+mod registration;
 pub mod result;
 mod result_content;
 pub mod run_files;
 mod scanner_cloud;
 pub mod sdf;
-pub mod stitching_document;
+pub mod simulation_folder;
+mod stitching_document;
 mod stl;
 mod system;
 mod unit;
@@ -80,12 +82,14 @@ pub use number::LIMIT_MM;
 pub use persistent_counter::PersistentCounter;
 pub use ply::{PlyFile, parse_ply, read_ply};
 pub use points::{parse_points, read_nominal_points, read_points, read_points_with_notes};
+pub use recipe_folder::{RecipeFolder, RecipeVersion};
 pub use registration::{
     DeviationRow, PrivateDraft, read_deviations, sync_folder, try_writing, write_atomic, write_column,
     write_deviations, write_json_atomic, write_points, write_private,
 };
 pub use scanner_cloud::parse_scanner_cloud;
 pub use sdf::{parse_sdf, read_sdf};
+pub use simulation_folder::SimulationFolder;
 pub use stitching_document::{STITCHED_POINTS, StitchingDocument, save_stitching};
 pub use stl::{StlFile, parse_stl, read_stl};
 pub use system::{OpenToOthers, is_same_file, readable_by_others, user_name};

@@ -58,6 +58,8 @@ pub enum Section {
     Page,
     /// Texts of the report.
     Report,
+    /// Texts of the page on which recipes are written.
+    Workbench,
 }
 
 /// Makes an enum of texts, with the section in which the files of the languages have them.
@@ -110,6 +112,9 @@ struct Catalogue {
     /// Texts of the report. The keys have the names of the variants of `ReportText`.
     #[serde(default)]
     report: HashMap<String, String>,
+    /// Texts of the page on which recipes are written. The keys have the names of the variants of `WorkbenchText`.
+    #[serde(default)]
+    workbench: HashMap<String, String>,
     #[serde(default)]
     alarms: BTreeMap<AlarmId, AlarmEntry>,
 }
@@ -117,7 +122,7 @@ struct Catalogue {
 impl Catalogue {
     fn read(text: &str) -> Result<Self, toml::de::Error> {
         let mut catalogue: Self = toml::from_str(text)?;
-        for section in [&mut catalogue.page, &mut catalogue.report] {
+        for section in [&mut catalogue.page, &mut catalogue.report, &mut catalogue.workbench] {
             *section = section.drain().map(|(key, text)| (variant_name(&key), text)).collect();
         }
         Ok(catalogue)
@@ -146,6 +151,7 @@ impl Language {
         let texts = match section {
             Section::Page => &catalogue.page,
             Section::Report => &catalogue.report,
+            Section::Workbench => &catalogue.workbench,
         };
         texts.get(name).map_or("", String::as_str)
     }
@@ -190,7 +196,9 @@ mod tests {
         let english = Catalogue::read(Language::En.file()).unwrap();
         for language in Language::ALL {
             let read = Catalogue::read(language.file()).unwrap_or_else(|error| panic!("{language:?}: {error}"));
-            for (english, read) in [(&english.page, &read.page), (&english.report, &read.report)] {
+            for (english, read) in
+                [(&english.page, &read.page), (&english.report, &read.report), (&english.workbench, &read.workbench)]
+            {
                 for key in english.keys() {
                     assert!(read.get(key).is_some_and(|text| !text.trim().is_empty()), "{language:?} has no {key}");
                 }

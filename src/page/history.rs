@@ -45,6 +45,11 @@ impl History {
         self.ids().filter_map(|id| self.folder(&id)).filter(|folder| is_live(folder)).collect()
     }
 
+    /// Returns the folder of a run, if there is one. Blocks while it reads the disk.
+    pub(crate) fn first(&self) -> Option<PathBuf> {
+        self.ids().find_map(|id| self.folder(&id))
+    }
+
     fn ids(&self) -> impl Iterator<Item = String> + use<> {
         let folders = std::fs::read_dir(&self.runs).into_iter().flatten().filter_map(Result::ok);
         folders.filter_map(|entry| entry.file_name().into_string().ok())

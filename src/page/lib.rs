@@ -40,6 +40,7 @@ mod tls;
 mod users;
 mod view;
 mod viewers;
+mod workbench;
 
 use std::io;
 use std::path::PathBuf;
@@ -58,6 +59,7 @@ pub use tls::{Tls, TlsError};
 pub use users::{PageRole, Person, Users, UsersError, UsersFile};
 pub use view::plant_document;
 pub use viewers::Viewers;
+pub use workbench::{RecipePrograms, Workbench};
 
 use guard::Guard;
 use history::History;
@@ -85,12 +87,17 @@ impl Page {
         let on_record = Box::new(move |what| drop(orders::write_down(&runs, None, what)));
         let guard = Arc::new(Guard::new(entrance, PageSubject::Cell, log, on_record)?);
         let viewers = Viewers::new();
-        Ok(Self { guard, run_watcher: live, history, plan, viewers, first_run: None })
+        Ok(Self { guard, run_watcher: live, history, plan, viewers, workbench: None, first_run: None })
     }
 
     /// Shows the run named `run` first, even if other runs are active.
     pub fn with_first_run(self, run: Option<String>) -> Self {
         Self { first_run: run, ..self }
+    }
+
+    /// Adds the workbench, in which an engineer writes recipes.
+    pub fn with_workbench(self, workbench: Option<Workbench>) -> Self {
+        Self { workbench, ..self }
     }
 
     /// Returns the browsers that show a run now.
@@ -136,5 +143,6 @@ fn routes(page: Shared) -> Router {
         .route("/runs/{run}/cycles/{cycle}/map", get(shape::map))
         .route("/runs/{run}/cycles/{cycle}/points", get(shape::points))
         .route("/runs/{run}/cycles/{cycle}/files/{name}", get(shape::saved_file))
+        .merge(workbench::routes())
         .with_state(page)
 }

@@ -7,6 +7,7 @@ use super::guard::Guard;
 use super::history::History;
 use super::live::RunWatcher;
 use super::viewers::Viewers;
+use super::workbench::Workbench;
 
 /// Source of what a run folder says of its run only together with the planning of Regrind. Each function takes the
 /// folder of the run, and returns `None` if the recipe, the cell file or the first record is missing or invalid.
@@ -43,6 +44,8 @@ pub struct Page {
     pub(crate) history: Arc<History>,
     pub(crate) plan: Box<dyn RunPlan>,
     pub(crate) viewers: Viewers,
+    /// Workbench of the process engineer; `None` if the page has no folder of recipes.
+    pub(crate) workbench: Option<Workbench>,
     /// Name of the run that the first page shows; None for the active run, or for the list if more than one is active.
     pub(crate) first_run: Option<String>,
 }

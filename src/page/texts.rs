@@ -13,7 +13,7 @@ regrind_language::texts! {
     /// Text of the page.
     Text in Page:
     // The frame of the page.
-    Cell Runs Parts Machines Settings Components Record ShiftLog Events NewEntry AddEntry Time Who Kind What Older RecordIntact SignedUpTo NotSigned RecordBroken
+    Cell Runs Parts Recipes Machines Settings Components Record ShiftLog Events NewEntry AddEntry Time Who Kind What Older RecordIntact SignedUpTo NotSigned RecordBroken
     Compare Language Appearance AsTheSystem Light Dark HighContrast SkipToOrders Simulation
     NotConnected ProgramGone SimulationGone PageGone
     // Texts about the part.

@@ -198,7 +198,7 @@ fn cell(seen: &ObservedRun, id: &str, session: &Session, has_control: bool, lang
 }
 
 /// Returns `data` as JSON that is safe within an HTML script element: it contains no `<`.
-fn harmless(data: &Value) -> String {
+pub(super) fn harmless(data: &Value) -> String {
     data.to_string().replace('<', "\\u003c")
 }
 
@@ -268,6 +268,11 @@ fn colours(of: ColourMap) -> String {
 /// Returns a page of the cell without maps.
 pub(super) fn plain_document(title: &str, session: &Session, language: Language, main: Markup) -> Response {
     document(title, &Frame { language, person: session.person.as_ref(), kind: Kind::Plain(PageSubject::Cell) }, main)
+}
+
+/// Returns a page on which a recipe is written.
+pub(super) fn workbench_document(title: &str, session: &Session, language: Language, main: Markup) -> Response {
+    document(title, &Frame { language, person: session.person.as_ref(), kind: Kind::Workbench }, main)
 }
 
 /// Filter for a list of runs. An empty field matches all runs.
@@ -445,18 +450,19 @@ pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, h
         }
     });
     match read.await {
-        Ok(Ok(html)) => {
-            // The report contains its style. It must not run scripts and must not fetch anything.
-            let policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'";
-            let headers = [
-                (CONTENT_TYPE, "text/html; charset=utf-8"),
-                (HeaderName::from_static("content-security-policy"), policy),
-            ];
-            (headers, html).into_response()
-        }
+        Ok(Ok(html)) => report_document(html),
         Ok(Err(error)) => (StatusCode::UNPROCESSABLE_ENTITY, error.to_string()).into_response(),
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
+}
+
+/// Returns the response with a report. The report contains its style. It must not run scripts and must not fetch
+/// anything.
+pub(crate) fn report_document(html: Vec<u8>) -> Response {
+    let policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'";
+    let headers =
+        [(CONTENT_TYPE, "text/html; charset=utf-8"), (HeaderName::from_static("content-security-policy"), policy)];
+    (headers, html).into_response()
 }
 
 /// Returns the page for an address that does not exist, with the status 404. `of` says whether the server shows one
@@ -535,6 +541,8 @@ enum Kind<'a> {
     Plain(PageSubject),
     /// Page of the cell with maps.
     WithMaps,
+    /// Page on which a recipe is written.
+    Workbench,
     /// Page of the plant, which is reloaded after some seconds if it changes.
     Plant {
         again_s: Option<u32>,
@@ -546,7 +554,7 @@ impl Kind<'_> {
     fn subject(self) -> PageSubject {
         match self {
             Self::Plain(of) => of,
-            Self::WithMaps => PageSubject::Cell,
+            Self::WithMaps | Self::Workbench => PageSubject::Cell,
             Self::Plant { .. } => PageSubject::Plant,
         }
     }
@@ -580,6 +588,12 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                 script src="/assets/theme.js" {}
                 script src="/assets/post.js" defer {}
                 @if matches!(kind, Kind::Plain(PageSubject::Cell)) { script src="/assets/refresh.js" defer {} }
+                @if matches!(kind, Kind::Workbench) {
+                    link rel="stylesheet" href="/assets/workbench.css";
+                    script src="/assets/codemirror.js" defer {}
+                    script src="/assets/scene.js" defer {}
+                    script src="/assets/workbench.js" defer {}
+                }
                 @if matches!(kind, Kind::WithMaps) {
                     script src="/assets/map.js" defer {}
                     script src="/assets/relief.js" defer {}
@@ -590,7 +604,7 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                 nav {
                     span .brand { "Regrind" }
                     @match kind.subject() {
-                        PageSubject::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } " " a href="/parts" { (say(Text::Parts)) } " " a href="/machines" { (say(Text::Machines)) } " " a href="/settings" { (say(Text::Settings)) } }
+                        PageSubject::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } " " a href="/parts" { (say(Text::Parts)) } " " a href="/recipes" { (say(Text::Recipes)) } " " a href="/machines" { (say(Text::Machines)) } " " a href="/settings" { (say(Text::Settings)) } }
                         PageSubject::Plant => {
                             @for (path, name) in [("/", "Plant"), ("/trend", "Trend"), ("/cells", "Compare"), ("/parts", "Parts")] { a href=(path) { (name) } " " }
                         }

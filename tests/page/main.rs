@@ -11,6 +11,7 @@ mod speed;
 mod strangers;
 mod users;
 mod views;
+mod workbench;
 
 use std::path::{Path, PathBuf};
 

@@ -18,3 +18,9 @@ pub(super) struct Ending {
     /// True if the terminal was closed. This event can arrive twice.
     pub(super) hung_up: bool,
 }
+
+/// Steps by which the priority of a program is lowered that works beside the programs of this computer.
+#[cfg(feature = "plant")]
+pub(super) const BACKGROUND_STEPS: i32 = 10;
+/// Steps to the lowest priority of a program.
+pub(super) const LOWEST_STEPS: i32 = 19;

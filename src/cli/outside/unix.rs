@@ -70,11 +70,10 @@ pub(crate) fn is_in_front() -> bool {
     rustix::termios::tcgetpgrp(io::stdin()).is_ok_and(|group| group == rustix::process::getpgrp())
 }
 
-/// Lowers the scheduling priority of this process (nice 10), if the system permits it.
-#[cfg(feature = "plant")]
-pub(crate) fn give_way() {
+/// Lowers the scheduling priority of this process by `steps`, if the system permits it.
+pub(crate) fn give_way(steps: i32) {
     // Without the permission the program continues at its priority.
-    let _ = rustix::process::nice(10);
+    let _ = rustix::process::nice(steps);
 }
 
 /// Puts a child program, before its start, into a process group of its own. Ctrl-C at the terminal of this program then

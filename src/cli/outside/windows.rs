@@ -74,8 +74,7 @@ pub(crate) fn is_in_front() -> bool {
 }
 
 /// Does nothing. On Unix this function lowers the priority of the process; on Windows the system decides.
-#[cfg(feature = "plant")]
-pub(crate) fn give_way() {}
+pub(crate) fn give_way(_steps: i32) {}
 
 /// Sets the start options of a child program so that Ctrl-C at the terminal of this program does not end the child.
 pub(crate) fn set_apart(command: &mut Command) {

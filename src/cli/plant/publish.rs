@@ -67,7 +67,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let config = read(&arguments.plant)?;
     let cell = cell_of(&config)?;
     // Other programs of this computer have priority.
-    outside::give_way();
+    outside::give_way(outside::BACKGROUND_STEPS);
     super::super::runtime()?.block_on(async {
         let mut endings = outside::Endings::new().map_err(Failure::Signals)?;
         let ended = async {

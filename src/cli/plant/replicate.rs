@@ -60,7 +60,7 @@ pub(in crate::cli) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let config = read(&arguments.plant)?;
     // Other programs of this computer have priority.
-    outside::give_way();
+    outside::give_way(outside::BACKGROUND_STEPS);
     let mut shipping = Replication {
         shipper: Replicator::new(arguments.runs.clone(), config.artefacts.clone()),
         config,

@@ -115,6 +115,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         let lease = taken.lease.clone();
         let outcome = making::run(&making::Arguments {
             rehearsal: false,
+            draft: None,
             recipe,
             cell: arguments.cell.clone(),
             part: Some(taken.lease.serial.clone()),

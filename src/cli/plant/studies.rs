@@ -259,7 +259,7 @@ fn begin(arguments: &ToBegin) -> Result<Outcome, Failure> {
 fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
     // The work of a person at this computer has priority.
-    outside::give_way();
+    outside::give_way(outside::BACKGROUND_STEPS);
     super::super::runtime()?.block_on(async {
         // A wrong plant file, or a database that cannot be reached at the start, is told at once.
         drop(open(&config).await?);

@@ -238,10 +238,20 @@ impl Study {
         Self { worker: Running::new(regrind(&work, plant.home.path())) }
     }
 
-    /// Asserts that the worker has survived everything, and that each run of the study has a result.
+    /// Asserts that the worker has survived everything, and that each of the `seeds` runs of the study has a result. The
+    /// cells can have kept the worker from the processors, so it has time as long as it makes runs.
     fn is_done(mut self, plant: &Plant, seeds: usize) {
-        let done = "SELECT count(*) FROM study_job WHERE state = 'done'";
-        self.worker.until("the study", |_| (plant.sql(done) == seeds.to_string()).then_some(()));
+        let count = |state: &str| plant.sql(&format!("SELECT count(*) FROM study_job WHERE state IN ({state})"));
+        let mut open = count("'open', 'leased'");
+        println!("{open} of {seeds} runs of the study are left");
+        while open != "0" {
+            let before = open;
+            open = self
+                .worker
+                .until("another run of the study", |_| Some(count("'open', 'leased'")).filter(|open| *open != before));
+        }
+        let failed = plant.sql("SELECT string_agg(result ->> 'error', '; ') FROM study_job WHERE state = 'failed'");
+        assert_eq!((count("'done'"), failed.as_str()), (seeds.to_string(), ""));
         self.worker.signal("KILL");
         self.worker.end();
     }

@@ -52,14 +52,7 @@ impl Scallops {
         pattern: TrackPattern,
         track_mm: f64,
     ) -> Self {
-        let height = |place: &[f64; 2]| {
-            let bend = wanted.curvature_at(*place);
-            let wheel = wheel_at(&bend.contact);
-            let Groove { curvature_per_mm: bend, stretch } =
-                groove(&bend, relative_to_middle(outline, *place), &wheel, pattern);
-            let height = (track_mm * stretch).powi(2) * bend / 8.0;
-            if height.is_finite() { height } else { 0.0 }
-        };
+        let height = |place: &[f64; 2]| height_at(wanted, outline, &wheel_at, pattern, track_mm, *place);
         let inside: Vec<f64> = on_grid(outline, PLACES).par_iter().map(height).collect();
         let border = outline.outline_mm(4 * PLACES).par_iter().map(height).reduce(|| 0.0, f64::max);
         let mean_of = |power: i32| inside.iter().map(|h| h.powi(power)).sum::<f64>() / inside.len().max(1) as f64;
@@ -88,7 +81,31 @@ impl Scallops {
     }
 }
 
+/// Returns the height of the scallops at `place` (x and y in millimetres), in millimetres. The other arguments are those
+/// of [`Scallops::compute`]. Returns 0 at a place where the wheel does not fit.
+fn height_at(
+    wanted: &TargetSurface,
+    outline: &Aperture,
+    wheel_at: impl Fn(&Contact) -> Wheel,
+    pattern: TrackPattern,
+    track_mm: f64,
+    place: [f64; 2],
+) -> f64 {
+    let bend = wanted.curvature_at(place);
+    let wheel = wheel_at(&bend.contact);
+    let Groove { curvature_per_mm: bend, stretch } = groove(&bend, relative_to_middle(outline, place), &wheel, pattern);
+    let height = (track_mm * stretch).powi(2) * bend / 8.0;
+    if height.is_finite() { height } else { 0.0 }
+}
+
 impl ToolPath {
+    /// Returns the height of the scallops that this path leaves at `place` (x and y in millimetres), in millimetres.
+    pub fn scallop_height_at(&self, place: [f64; 2]) -> f64 {
+        let options = self.options();
+        let wheel_at = |contact: &Contact| options.wheel_at(contact);
+        height_at(self.target(), self.outline(), wheel_at, options.pattern, self.track_mm(), place)
+    }
+
     /// Returns height, rms and mean of the scallops that this path leaves on the part. Scallops are the ridges between
     /// tracks.
     pub fn scallops(&self) -> Scallops {
@@ -176,7 +193,9 @@ mod tests {
     #[test]
     fn tool_path_reports_scallops() {
         let laid = path(quadric(0.0, 0.0), ball(12.5)).unwrap();
-        assert!((laid.scallops().height_mm - laid.track_mm().powi(2) / 100.0).abs() < 1e-12);
+        let height_mm = laid.track_mm().powi(2) / 100.0;
+        assert!((laid.scallops().height_mm - height_mm).abs() < 1e-12);
+        assert!((laid.scallop_height_at([0.3, -0.2]) - height_mm).abs() < 1e-12);
         let spiral = path(quadric(0.0, 0.0), PathOptions { pattern: TrackPattern::Spiral, ..ball(12.5) }).unwrap();
         assert!((spiral.scallops().height_mm - 2.5e-3).abs() < 1e-12);
     }

@@ -1,5 +1,5 @@
-//! Forecast of a refusal that the nominal surface alone decides, from a measurement that is computed before anything
-//! moves.
+//! Forecast of what the shape of a part and its targets alone decide, from a measurement that is computed before
+//! anything moves: the weak directions of the registration, and a refusal.
 
 use std::f64::consts::{SQRT_2, TAU};
 
@@ -10,7 +10,7 @@ use super::task::Task;
 use crate::geometry::{Point, Vector};
 use crate::measuring::Target;
 use crate::model::{Form, ModelInputs};
-use crate::registration::map_obstacle;
+use crate::registration::{Registration, WeakDirection, map_obstacle};
 
 /// Number of waves of the form error.
 const WAVES: usize = 48;
@@ -19,35 +19,29 @@ const MAX_TARGETS: usize = 1200;
 /// Noise of a touch, as a share of the form error.
 const NOISE_SHARE: f64 = 0.05;
 
-/// Returns the reason why the first measurement of the part would end without a correction, in the words of the alarm
-/// of the cell. Returns `None` if no refusal is expected.
+/// Forecast of a measurement.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct MeasurementForecast {
+    /// Directions in which the registration determines the pose poorly.
+    pub weak_directions: Vec<WeakDirection>,
+    /// Reason why the measurement would end without a correction, in the words of the alarm of the cell; `None` if no
+    /// refusal is expected.
+    pub refusal: Option<String>,
+}
+
+/// Returns the forecast of the first measurement of the part of `task`.
 ///
 /// The measurement is computed: the targets of the plan on the nominal surface, with a random form error and with noise.
 /// The form error has the root mean square `rms_mm` after the best fit. Its correlation length is as long as the part is
 /// large (root mean square distance of the targets from their centroid). The measurement is registered and judged as one
 /// of a run is.
-pub fn forecast_refusal(task: &Task, rms_mm: f64) -> Option<String> {
-    let every = task.targets.len().div_ceil(MAX_TARGETS).max(1);
-    let targets: Vec<&Target> = task.targets.iter().step_by(every).collect();
-    let places: Vec<Point> = targets.iter().map(|target| target.point).collect();
-    let radius_mm = task.probing.probe_radius_mm;
-    let measure = |rms_mm: f64| {
-        let errors_mm = form_errors(&places, rms_mm);
-        let centre = |(target, error_mm): (&&Target, f64)| {
-            task.fixture_cmm_from_model.transform_point(&(target.point + (radius_mm + error_mm) * target.normal))
-        };
-        let centres: Vec<Point> = targets.iter().zip(errors_mm).map(centre).collect();
-        let found = task.register_with_start(&centres, radius_mm, true).map_err(|error| error.to_string())?.0;
-        match found.unjudgeable_reason() {
-            Some(reason) => Err(reason),
-            None => Ok(found),
-        }
-    };
+pub fn forecast_measurement(task: &Task, rms_mm: f64) -> MeasurementForecast {
     // The best fit takes a part of the form error, so that more of it is needed to leave `rms_mm`.
-    let found = measure(rms_mm).and_then(|found| measure(rms_mm * rms_mm / found.quality.rms_mm.max(0.1 * rms_mm)));
+    let found = registered_forecast(task, rms_mm)
+        .and_then(|found| registered_forecast(task, rms_mm * rms_mm / found.quality.rms_mm.max(0.1 * rms_mm)));
     let found = match found {
         Ok(found) => found,
-        Err(reason) => return Some(reason),
+        Err(reason) => return MeasurementForecast { refusal: Some(reason), ..MeasurementForecast::default() },
     };
     let inputs = ModelInputs {
         machine: task.machine_uncertainty,
@@ -56,7 +50,24 @@ pub fn forecast_refusal(task: &Task, rms_mm: f64) -> Option<String> {
     };
     let form = Form::estimate(&found, &inputs);
     let covariance = form.as_ref().map_or(&found.quality.covariance, |form| &form.frame_covariance);
-    map_obstacle(&found, covariance, &task.map_limits)
+    let refusal = map_obstacle(&found, covariance, &task.map_limits);
+    MeasurementForecast { weak_directions: found.quality.weak_directions, refusal }
+}
+
+/// Returns the registration of a computed measurement whose form error has the root mean square `rms_mm` before the best
+/// fit. Returns an error with the reason if it cannot be registered or judged.
+fn registered_forecast(task: &Task, rms_mm: f64) -> Result<Registration, String> {
+    let every = task.targets.len().div_ceil(MAX_TARGETS).max(1);
+    let targets: Vec<&Target> = task.targets.iter().step_by(every).collect();
+    let places: Vec<Point> = targets.iter().map(|target| target.point).collect();
+    let radius_mm = task.probing.probe_radius_mm;
+    let errors_mm = form_errors(&places, rms_mm);
+    let centre = |(target, error_mm): (&&Target, f64)| {
+        task.fixture_cmm_from_model.transform_point(&(target.point + (radius_mm + error_mm) * target.normal))
+    };
+    let centres: Vec<Point> = targets.iter().zip(errors_mm).map(centre).collect();
+    let found = task.register_with_start(&centres, radius_mm, true).map_err(|error| error.to_string())?.0;
+    found.unjudgeable_reason().map_or(Ok(found), Err)
 }
 
 /// Returns a form error with noise at each of the `places`, in mm. The same places give the same errors.

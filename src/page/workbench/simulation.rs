@@ -1,0 +1,319 @@
+//! Runs a recipe on simulated machines in a child program, and shows how it converges.
+
+use std::convert::Infallible;
+use std::path::PathBuf;
+use std::process::Stdio;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::Extension;
+use axum::body::Bytes;
+use axum::extract::{Path, State};
+use axum::http::header::CONTENT_TYPE;
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::sse::{Event, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::stream::unfold;
+use maud::{Markup, html};
+use regrind_formats::SimulationFolder;
+use regrind_formats::run_files::CycleFile;
+use regrind_language::Language;
+use regrind_report::ReportOptions;
+use serde::Deserialize;
+use serde_json::json;
+use tokio::io::AsyncReadExt;
+use tokio::process::{Child, Command};
+use tokio::sync::watch::{Receiver, Sender};
+use tokio::task::{AbortHandle, spawn_blocking};
+
+use super::super::chart::chart;
+use super::super::guard::{Session, foreign};
+use super::super::history::History;
+use super::super::live::{ObservedRun, RunWatcher, verdict};
+use super::super::pieces::figures;
+use super::super::shared::Shared;
+use super::super::view::language;
+use super::texts::WorkbenchText;
+use super::{Workbench, for_engineer, refused};
+
+/// Time between two looks at a simulation.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
+/// Maximum size of the messages of the child program that are kept, in bytes.
+const MAX_MESSAGE_BYTES: u64 = 4096;
+
+/// Run on simulated machines, and the child program that drives it.
+pub(super) struct Simulation {
+    /// Name of the recipe.
+    name: String,
+    seed: u64,
+    history: Arc<History>,
+    watcher: RunWatcher,
+    ended: Receiver<Option<EndedSimulation>>,
+    program: AbortHandle,
+    /// The folder is deleted with the last of its users.
+    _folder: Arc<SimulationFolder>,
+}
+
+impl Drop for Simulation {
+    fn drop(&mut self) {
+        self.program.abort();
+    }
+}
+
+/// End of the child program.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct EndedSimulation {
+    /// True if the program has made a run to its end, with an accepted part or not.
+    is_complete: bool,
+    /// Messages of the program.
+    message: String,
+}
+
+/// Text that is to be simulated.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ToSimulate {
+    text: String,
+    seed: u64,
+}
+
+/// Starts a simulation of a text as the recipe named `name`. A simulation that is under way ends.
+pub(crate) async fn begin(
+    State(page): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+    body: Bytes,
+) -> Response {
+    let workbench = match permitted(&page, &session, &headers) {
+        Ok(workbench) => workbench,
+        Err(response) => return response,
+    };
+    let Ok(ToSimulate { text, seed }) = serde_json::from_slice(&body) else {
+        return refused(StatusCode::BAD_REQUEST, "the request is not that of this page; load the page again");
+    };
+    let Some(recipe) = workbench.recipes.file(&name) else {
+        return refused(StatusCode::NOT_FOUND, "this is no name for a recipe");
+    };
+    let folder = match spawn_blocking(move || SimulationFolder::create(&text)).await {
+        Ok(Ok(folder)) => Arc::new(folder),
+        Ok(Err(error)) => return refused(StatusCode::INSUFFICIENT_STORAGE, error.to_string()),
+        Err(_) => return StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    };
+    let command = workbench.programs.simulation(&recipe, &folder.draft(), &folder.runs(), seed);
+    match started(command.into(), name, seed, folder) {
+        Ok(simulation) => {
+            *workbench.simulation() = Some(simulation);
+            StatusCode::NO_CONTENT.into_response()
+        }
+        Err(error) => refused(StatusCode::INTERNAL_SERVER_ERROR, format!("the simulation cannot start: {error}")),
+    }
+}
+
+/// Ends the simulation of the recipe named `name`.
+pub(crate) async fn end(
+    State(page): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    let workbench = match permitted(&page, &session, &headers) {
+        Ok(workbench) => workbench,
+        Err(response) => return response,
+    };
+    workbench.simulation().take_if(|simulation| simulation.name == name);
+    StatusCode::NO_CONTENT.into_response()
+}
+
+fn permitted<'p>(page: &'p Shared, session: &Session, headers: &HeaderMap) -> Result<&'p Workbench, Response> {
+    if let Some(what) = foreign(&page.guard, headers, session) {
+        page.guard.refused(&what);
+        return Err(refused(StatusCode::FORBIDDEN, what));
+    }
+    for_engineer(page, session)
+}
+
+/// Starts the child program `command`, which runs in `folder`.
+fn started(
+    mut command: Command,
+    name: String,
+    seed: u64,
+    folder: Arc<SimulationFolder>,
+) -> std::io::Result<Simulation> {
+    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).kill_on_drop(true);
+    let child = command.spawn()?;
+    let (end, ended) = tokio::sync::watch::channel(None);
+    let kept = Arc::clone(&folder);
+    let program = tokio::spawn(async move {
+        wait_for_end(child, end).await;
+        drop(kept);
+    });
+    let history = Arc::new(History::new(folder.runs()));
+    let watcher = RunWatcher::new(Arc::clone(&history));
+    Ok(Simulation { name, seed, history, watcher, ended, program: program.abort_handle(), _folder: folder })
+}
+
+/// Waits for the end of the child program, and tells it to `end`.
+async fn wait_for_end(mut child: Child, end: Sender<Option<EndedSimulation>>) {
+    let mut message = String::new();
+    if let Some(errors) = child.stderr.take() {
+        // A program that writes more is ended when the rest of its output has no reader.
+        let _ = errors.take(MAX_MESSAGE_BYTES).read_to_string(&mut message).await;
+    }
+    let status = child.wait().await.ok().and_then(|status| status.code());
+    let is_complete = matches!(status, Some(0 | 1));
+    // Nobody waits for it if the page has gone.
+    let _ = end.send(Some(EndedSimulation { is_complete, message: message.trim().to_owned() }));
+}
+
+/// Browser that shows a simulation.
+struct SimulationEvents {
+    page: Shared,
+    session: Session,
+    name: String,
+    language: Language,
+    sent: Option<(String, bool)>,
+}
+
+/// Streams how the simulation of the recipe named `name` converges: pieces of HTML, sent only if they differ from the
+/// last ones. The stream ends with the simulation.
+pub(crate) async fn events(
+    State(page): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    if let Err(response) = for_engineer(&page, &session) {
+        return response;
+    }
+    let looking = SimulationEvents { language: language(&headers), page, session, name, sent: None };
+    Sse::new(unfold(looking, |mut looking| async {
+        let event = looking.next().await?;
+        Some((Ok::<_, Infallible>(event), looking))
+    }))
+    .into_response()
+}
+
+impl SimulationEvents {
+    /// Waits until the simulation has changed, and returns the next message for the browser. Returns `None` when the
+    /// simulation has ended, or when there is none.
+    async fn next(&mut self) -> Option<Event> {
+        if self.sent.as_ref().is_some_and(|(_, is_over)| *is_over) {
+            return None;
+        }
+        loop {
+            if !self.page.guard.has_access(&self.session) {
+                return None;
+            }
+            let (html, is_over) = self.look()?;
+            if self.sent.as_ref() != Some(&(html.clone(), is_over)) {
+                let event = Event::default().json_data(json!({ "html": html, "isOver": is_over })).ok();
+                self.sent = Some((html, is_over));
+                return event;
+            }
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+    }
+
+    /// Returns the present HTML of the simulation, and true if it has ended. Returns `None` if there is none.
+    fn look(&self) -> Option<(String, bool)> {
+        let workbench = self.page.workbench.as_ref()?;
+        let simulation = workbench.simulation();
+        let simulation = simulation.as_ref().filter(|simulation| simulation.name == self.name)?;
+        let ended = simulation.ended.borrow().clone();
+        let seen = simulation.observed();
+        // The record can be read a moment after the program has ended.
+        let is_over = ended.as_ref().is_some_and(|ended| !ended.is_complete || verdict(&seen).is_some());
+        Some((pieces(simulation, &seen, ended.as_ref(), self.language).into_string(), is_over))
+    }
+}
+
+impl Simulation {
+    /// Returns the folder of the run, when the child program has created it.
+    fn run_folder(&self) -> Option<PathBuf> {
+        self.history.first()
+    }
+
+    fn observed(&self) -> ObservedRun {
+        let folder = self.run_folder();
+        folder.map_or_else(ObservedRun::default, |folder| self.watcher.subscribe(&folder).borrow().clone())
+    }
+}
+
+/// Returns the HTML of a simulation: what it does or how it has ended, and its cycles.
+fn pieces(simulation: &Simulation, seen: &ObservedRun, ended: Option<&EndedSimulation>, language: Language) -> Markup {
+    let say = |text: WorkbenchText| text.to(language);
+    let summary = &seen.summary;
+    let failed = ended.filter(|ended| !ended.is_complete);
+    html! {
+        p .verdict role="status" {
+            span .simulation { "SIMULATION" } " "
+            @match (failed, verdict(seen)) {
+                (Some(_), _) => strong { (say(WorkbenchText::SimulationFailed)) },
+                (None, Some(true)) => strong .good { (say(WorkbenchText::Accepted)) },
+                (None, Some(false)) => strong { (say(WorkbenchText::NotAccepted)) },
+                (None, None) => span { (say(WorkbenchText::Simulates)) },
+            }
+            " " span .quiet { (say(WorkbenchText::Seed)) " " (simulation.seed) }
+        }
+        @if let Some(failed) = failed { p .warns { (failed.message) } }
+        @if !summary.cycles.is_empty() {
+            (figures(&summary.cycles, summary.tolerance.as_ref(), language))
+            (chart(&summary.cycles, summary.tolerance.as_ref(), false, language))
+        }
+    }
+}
+
+/// Serves the error map of the last measured cycle of the simulation of the recipe named `name`, as a picture.
+pub(crate) async fn map(
+    State(page): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(name): Path<String>,
+) -> Response {
+    let found = of_run(&page, &session, &name, |folder, seen| {
+        let map = folder.join(seen.summary.cycles.iter().rev().find_map(|cycle| cycle.map.clone())?);
+        std::fs::read(map.parent()?.join(CycleFile::ErrorMapPng.name())).ok()
+    });
+    match found.await {
+        Ok(bytes) => ([(CONTENT_TYPE, "image/png")], bytes).into_response(),
+        Err(response) => response,
+    }
+}
+
+/// Serves the report of the simulation of the recipe named `name`.
+pub(crate) async fn report(
+    State(page): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    let language = language(&headers);
+    let found = of_run(&page, &session, &name, move |folder, _| {
+        regrind_report::run_report(folder, &ReportOptions { language, ..ReportOptions::default() }).ok()
+    });
+    match found.await {
+        Ok(html) => super::super::view::report_document(html.into_bytes()),
+        Err(response) => response,
+    }
+}
+
+/// Reads from the folder of the run of a simulation without blocking other requests.
+///
+/// # Errors
+/// Returns the response to the browser if there is no simulation of this recipe, or if `read` finds nothing.
+async fn of_run<T: Send + 'static>(
+    page: &Shared,
+    session: &Session,
+    name: &str,
+    read: impl FnOnce(&std::path::Path, &ObservedRun) -> Option<T> + Send + 'static,
+) -> Result<T, Response> {
+    let workbench = for_engineer(page, session)?;
+    let found = {
+        let simulation = workbench.simulation();
+        let simulation = simulation.as_ref().filter(|simulation| simulation.name == name);
+        simulation.and_then(|simulation| Some((simulation.run_folder()?, simulation.observed())))
+    };
+    let nothing = || refused(StatusCode::NOT_FOUND, "there is no such result of a simulation");
+    let Some((folder, seen)) = found else { return Err(nothing()) };
+    spawn_blocking(move || read(&folder, &seen)).await.ok().flatten().ok_or_else(nothing)
+}

@@ -1,0 +1,376 @@
+//! The workbench: who may use it, what it finds in a text, what it saves, and what it simulates.
+
+use std::path::Path;
+
+use regrind_testcell::browser::{Browser, Tab};
+use regrind_testcell::http::{Answer, Visitor};
+use regrind_testutils::sample::all;
+use serde_json::{Value, json};
+
+use crate::program::{Running, run, small_recipe};
+use crate::{serve_with, users};
+
+/// Begins a page with a folder of recipes, in which there is a small one.
+fn begin(home: &Path, more: &[&str]) -> (Running, String) {
+    let recipes = home.join("recipes");
+    std::fs::create_dir_all(&recipes).unwrap();
+    small_recipe(&recipes, 1e4);
+    serve_with(home, &[&["--listen", "127.0.0.1:0", "--recipes", "recipes"], more].concat())
+}
+
+fn small_text(home: &Path) -> String {
+    std::fs::read_to_string(home.join("recipes/small.toml")).unwrap()
+}
+
+fn draft(visitor: &Visitor, name: &str, text: &str) -> Vec<Value> {
+    let answer = visitor.post(&format!("/recipes/{name}/draft"), &[("Origin", &visitor.origin())], text.as_bytes());
+    assert_eq!(answer.status, 200, "{answer:?}");
+    unchunked(&answer).lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+/// Returns the body of an answer that comes in pieces.
+fn unchunked(answer: &Answer) -> String {
+    if answer.header("transfer-encoding").is_empty() {
+        return answer.text();
+    }
+    let (mut text, mut rest) = (Vec::new(), &answer.body[..]);
+    loop {
+        let end = rest.windows(2).position(|two| two == b"\r\n").unwrap();
+        let length = usize::from_str_radix(std::str::from_utf8(&rest[..end]).unwrap(), 16).unwrap();
+        if length == 0 {
+            return String::from_utf8(text).unwrap();
+        }
+        text.extend(&rest[end + 2..end + 2 + length]);
+        rest = &rest[end + 4 + length..];
+    }
+}
+
+fn post(visitor: &Visitor, path: &str, body: &Value) -> (u16, Value) {
+    let (origin, token) = (visitor.origin(), visitor.token());
+    let answer = visitor.post(path, &[("Origin", &origin), ("X-Regrind-Token", &token)], body.to_string().as_bytes());
+    (answer.status, serde_json::from_slice(&answer.body).unwrap_or(Value::Null))
+}
+
+#[test]
+fn draft_tells_problems_plan_and_shape() {
+    let home = tempfile::tempdir().unwrap();
+    let (_page, url) = begin(home.path(), &[]);
+    let visitor = Visitor::with_key(&url);
+    let text = small_text(home.path());
+    let told = draft(&visitor, "small.toml", &text);
+    let kinds: Vec<&str> = told.iter().map(|line| line["kind"].as_str().unwrap()).collect();
+    assert_eq!(kinds, ["checked", "planned", "shape"]);
+    assert_eq!(told[0]["problems"], json!([]));
+    assert_eq!(told[1]["plan"]["targets"], 16 * 12);
+    let shape = &told[2];
+    let [columns, rows] = ["columns", "rows"].map(|key| shape[key].as_u64().unwrap() as usize);
+    assert_eq!(shape["heights_mm"].as_array().unwrap().len(), columns * rows);
+    assert_eq!(shape["scallops_nm"].as_array().unwrap().len(), columns * rows);
+    assert_eq!(shape["targets_mm"].as_array().unwrap().len(), 16 * 12);
+    // The heights at the corners are those of the formula, which the recipe states.
+    let of_formula = |x: f64, y: f64| {
+        let [u, v] = [x / 50.0, y / 50.0];
+        2.1 * u - 1.4 * v + 10.5 * u * u + 2.4 * u * v - 13.3 * v * v + 2.6 * u.powi(3) - 3.5 * u * u * v
+            + 3.0 * u * v * v
+            + 1.6 * v.powi(3)
+            - 1.7 * u.powi(4)
+            + 1.2 * u.powi(3) * v
+            + 1.6 * u * u * v * v
+            - 1.4 * u * v.powi(3)
+            + 1.2 * v.powi(4)
+    };
+    for (k, at) in [(0, [-51.0, -31.0]), (columns - 1, [51.0, -31.0]), (columns * rows - 1, [51.0, 31.0])] {
+        let found = shape["heights_mm"][k].as_f64().unwrap();
+        assert!((found - of_formula(at[0], at[1])).abs() < 1e-4, "{at:?}: {found}");
+    }
+    // A wrong key and a wrong unit, each with its line.
+    let wrong =
+        text.replace("track_mm = 0.24", "trak_mm = 0.24").replace("probe_radius_mm = 1.5", "probe_radius_mm = 1500");
+    let told = draft(&visitor, "small.toml", &wrong);
+    assert_eq!(told.len(), 1, "{told:?}");
+    let line_of = |words: &str| wrong.lines().position(|line| line.starts_with(words)).unwrap() + 1;
+    let problems = told[0]["problems"].as_array().unwrap();
+    let found: Vec<(u64, &str)> =
+        problems.iter().map(|of| (of["line"].as_u64().unwrap(), of["key"].as_str().unwrap())).collect();
+    let expected = [
+        (line_of("probe_radius_mm") as u64, "measure.probe_radius_mm"),
+        (line_of("trak_mm") as u64, "grinding.trak_mm"),
+    ];
+    assert_eq!(found, expected, "{problems:?}");
+    assert!(problems[1]["remedy"].as_str().unwrap().contains("track_mm"), "{problems:?}");
+    // A text that is no recipe at all, and one that the cell cannot make.
+    assert_eq!(draft(&visitor, "small.toml", "")[0]["kind"], "checked");
+    let too_fast = text.replace("feed_mm_min = 1000.0", "feed_mm_min = 50000.0");
+    let told = draft(&visitor, "small.toml", &too_fast);
+    assert_eq!(told[1]["kind"], "refused", "{told:?}");
+    assert!(told[1]["reason"].as_str().unwrap().contains("grinding.feed_mm_min"), "{told:?}");
+    assert_eq!(small_text(home.path()), text, "a draft changes no file");
+}
+
+#[test]
+fn saved_text_is_file_and_version() {
+    let home = tempfile::tempdir().unwrap();
+    let (_page, url) = begin(home.path(), &[]);
+    let visitor = Visitor::with_key(&url);
+    let text = small_text(home.path());
+    let next = text.replace("rows = 12", "rows = 13");
+    let (status, saved) = post(&visitor, "/recipes/small.toml/save", &json!({ "text": next, "replaces": text }));
+    // Version 1 is the text that was in the file before.
+    assert_eq!((status, &saved["version"]), (200, &json!(2)), "{saved}");
+    assert_eq!(small_text(home.path()), next);
+    assert_eq!(visitor.get("/recipes/small.toml/versions/1").text(), text);
+    let versions: Value = serde_json::from_slice(&visitor.get("/recipes/small.toml/versions").body).unwrap();
+    assert_eq!(versions.as_array().unwrap().len(), 2);
+    // Another program changes the file, and the page does not overwrite it.
+    std::fs::write(home.path().join("recipes/small.toml"), format!("{next}# by hand\n")).unwrap();
+    let (status, said) = post(&visitor, "/recipes/small.toml/save", &json!({ "text": text, "replaces": next }));
+    assert_eq!(status, 409, "{said}");
+    assert!(small_text(home.path()).ends_with("# by hand\n"));
+    // A new recipe, and names that lead elsewhere.
+    let (status, _) = post(&visitor, "/recipes/new%20part.toml/save", &json!({ "text": text, "replaces": null }));
+    assert_eq!(status, 200);
+    assert_eq!(run(&["check", "recipes/new part.toml"], home.path()).0, 0);
+    for name in ["..%2Fx.toml", "%2e%2e%2fx.toml", ".hidden.toml", "x.txt", "a%00.toml"] {
+        let (status, said) =
+            post(&visitor, &format!("/recipes/{name}/save"), &json!({ "text": text, "replaces": null }));
+        assert_eq!(status, 400, "{name}: {said}");
+        assert_eq!(visitor.get(&format!("/recipes/{name}/text")).status, 404, "{name}");
+    }
+    assert!(!home.path().join("x.toml").exists());
+}
+
+#[test]
+fn only_engineers_use_workbench() {
+    let home = tempfile::tempdir().unwrap();
+    for role in ["operator", "engineer"] {
+        assert_eq!(users::add(home.path(), role, role, users::PASSWORD).0, 0);
+    }
+    let (_page, url) = begin(home.path(), &["--users", "users.toml"]);
+    let text = small_text(home.path());
+    let operator = Visitor::signed_in(&url, "operator", users::PASSWORD).unwrap();
+    let engineer = Visitor::signed_in(&url, "engineer", users::PASSWORD).unwrap();
+    let stranger = Visitor::stranger(&url);
+    let save = json!({ "text": format!("{text}#\n"), "replaces": text });
+    for path in ["/recipes/small.toml/save", "/recipes/small.toml/simulation", "/recipes/small.toml/simulation/end"] {
+        assert_eq!(post(&operator, path, &save).0, 403, "{path}");
+        assert_eq!(stranger.post(path, &[("Origin", &stranger.origin())], b"{}").status, 401, "{path}");
+        // Without a token, or from another page, even an engineer changes nothing.
+        assert_eq!(engineer.post(path, &[("Origin", &engineer.origin())], save.to_string().as_bytes()).status, 403);
+        let token = engineer.token();
+        let headers = [("Origin", "http://elsewhere.example"), ("X-Regrind-Token", &token[..])];
+        assert_eq!(engineer.post(path, &headers, save.to_string().as_bytes()).status, 403, "{path}");
+    }
+    let path = "/recipes/small.toml/draft";
+    assert_eq!(operator.post(path, &[("Origin", &operator.origin())], text.as_bytes()).status, 403);
+    assert_eq!(engineer.post(path, &[("Origin", "http://elsewhere.example")], text.as_bytes()).status, 403);
+    for path in [
+        "/recipes/small.toml/text",
+        "/recipes/small.toml/versions",
+        "/recipe-schema",
+        "/recipes/small.toml/simulation/report",
+    ] {
+        assert_eq!(operator.get(path).status, 403, "{path}");
+    }
+    assert!(!operator.get("/recipes").text().contains("small.toml"));
+    assert_eq!(small_text(home.path()), text);
+    assert!(engineer.get("/recipes").text().contains("/recipes/small.toml"));
+    assert_eq!(post(&engineer, "/recipes/small.toml/save", &save).0, 200);
+    let versions: Value = serde_json::from_slice(&engineer.get("/recipes/small.toml/versions").body).unwrap();
+    assert_eq!(versions[1]["saved_by"], "engineer");
+}
+
+/// Reads the events of a simulation to their end. Returns the last one.
+fn last_event(visitor: &Visitor) -> Value {
+    let answer = visitor.get("/recipes/small.toml/simulation/events");
+    assert_eq!(answer.status, 200, "{answer:?}");
+    let text = unchunked(&answer);
+    let last = text.lines().filter_map(|line| line.strip_prefix("data: ")).next_back().expect("an event");
+    serde_json::from_str(last).unwrap()
+}
+
+#[test]
+fn text_is_simulated_without_saving() {
+    let home = tempfile::tempdir().unwrap();
+    let (_page, url) = begin(home.path(), &[]);
+    let visitor = Visitor::with_key(&url);
+    let text = small_text(home.path()).replace("rows = 12", "rows = 14");
+    let task = json!({ "text": text, "seed": 7 });
+    assert_eq!(post(&visitor, "/recipes/small.toml/simulation", &task).0, 204);
+    let last = last_event(&visitor);
+    assert_eq!(last["isOver"], true);
+    let html = last["html"].as_str().unwrap();
+    assert!(html.contains("ACCEPTED") && !html.contains("NOT ACCEPTED") && html.contains("SIMULATION"), "{html}");
+    let map = visitor.get("/recipes/small.toml/simulation/map");
+    assert!(map.status == 200 && map.body.starts_with(b"\x89PNG"), "{}", map.status);
+    let report = visitor.get("/recipes/small.toml/simulation/report");
+    assert!(report.status == 200 && report.text().contains("SIMULATION"));
+    // The runs of the cell, the file and its versions are unchanged.
+    assert_eq!(std::fs::read_dir(home.path().join("runs")).unwrap().count(), 0);
+    assert!(!small_text(home.path()).contains("rows = 14"));
+    // A recipe that cannot run is a failure with its reason.
+    let task = json!({ "text": text.replace("[part]", "[pert]"), "seed": 1 });
+    assert_eq!(post(&visitor, "/recipes/small.toml/simulation", &task).0, 204);
+    let last = last_event(&visitor);
+    assert!(last["isOver"] == true && last["html"].as_str().unwrap().contains("pert"), "{last}");
+    assert_eq!(post(&visitor, "/recipes/small.toml/simulation/end", &json!(null)).0, 204);
+    assert_eq!(visitor.get("/recipes/small.toml/simulation/map").status, 404);
+}
+
+/// A cell file with a real machine is refused for a draft, so that a text from a browser moves nothing.
+#[test]
+fn draft_runs_on_simulated_machines_only() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e4).display().to_string();
+    let cell = crate::program::root().join("config/modbus-tcp.toml").display().to_string();
+    let (code, _, errors) = run(&["run", &recipe, "--draft", &recipe, "--cell", &cell], home.path());
+    assert!(code == 2 && errors.contains("simulated machines only"), "{code} {errors}");
+}
+
+/// Recipe that a person writes from nothing, with a wrong key and a wrong unit. Its shape determines y poorly.
+const FROM_NOTHING: &str = r#"[part]
+name = "mirror"
+
+[nominal.surface]
+kind = "xy-polynomial"
+normalisation_radius_mm = 50.0
+terms = [[2, 0, 10.5], [1, 1, 2.4], [0, 2, -13.3], [3, 0, 2.6], [0, 3, 1.6], [4, 0, -1.7], [0, 4, 1.2]]
+
+[nominal.aperture]
+kind = "rectangle"
+width_mm = 102.0
+height_mm = 62.0
+
+[nominal.sampling]
+spacing_mm = 0.5
+
+[measure]
+probe_radius_mm = 1500
+side = "above"
+pattern = "grid"
+columns = 16
+rows = 12
+
+[acceptance]
+pv_um = 7.0
+
+[compensation]
+cutoff_mm = 14.0
+max_correction_um = 60.0
+removal_budget_um = 400.0
+depth_of_cut_um = 20.0
+
+[grinding]
+feed_mm_min = 1000.0
+trak_mm = 0.24
+allowance_um = 20.0
+
+[grinding.wheel]
+shape = "sphere"
+radius_mm = 12.5
+"#;
+
+fn editor_text(text: &str) -> String {
+    format!("window.regrindOpened.editor.setText({})", json!(text))
+}
+
+const PROBLEMS: &str = "[...document.querySelector('#editor').shadowRoot.querySelectorAll('.regrind-problem')].map((of) => of.textContent)";
+
+#[test]
+#[ignore = "needs a browser: Debian package chromium"]
+fn recipe_is_written_from_nothing() {
+    let home = tempfile::tempdir().unwrap();
+    let (_page, url) = begin(home.path(), &[]);
+    let mut browser = Browser::start(home.path());
+    let tab = browser.open(&url, [1366, 768]);
+    tab.until(&mut browser, "document.querySelector('nav')");
+    let place = url.split("/?").next().unwrap();
+    tab.send(&mut browser, "Page.navigate", json!({ "url": format!("{place}/recipes") }));
+    tab.until(&mut browser, "document.querySelector('#new-recipe')");
+    tab.read(&mut browser, "document.querySelector('#new-recipe input').value = 'mirror'");
+    tab.click(&mut browser, "#new-recipe button");
+    tab.until(
+        &mut browser,
+        "window.regrindOpened && document.querySelector('#problem-count').classList.contains('has-problems')",
+    );
+    // Keys are completed from the schema: a table is typed, and a key is chosen.
+    tab.read(&mut browser, &editor_text("[measure]\n"));
+    tab.read(&mut browser, "(() => { const { view } = window.regrindOpened.editor; view.dispatch({ selection: { anchor: view.state.doc.length } }); view.focus(); })()");
+    tab.send(&mut browser, "Input.insertText", json!({ "text": "probe_r" }));
+    tab.until(&mut browser, "document.querySelector('#editor').shadowRoot.querySelector('.cm-completionLabel')?.textContent === 'probe_radius_mm'");
+    tab.press(&mut browser, "Enter", 13, "\r");
+    tab.until(&mut browser, "window.regrindOpened.text().includes('probe_radius_mm = ')");
+    // A wrong key and a wrong unit stand below their lines before anything runs.
+    tab.read(&mut browser, &editor_text(FROM_NOTHING));
+    tab.until(&mut browser, &format!("{PROBLEMS}.length === 2"));
+    let problems = tab.read(&mut browser, PROBLEMS);
+    assert!(problems[0].as_str().unwrap().contains("measure.probe_radius_mm is 1500"), "{problems}");
+    assert!(problems[1].as_str().unwrap().contains("track_mm"), "{problems}");
+    assert_eq!(tab.read(&mut browser, "document.querySelector('#save').disabled"), true);
+    // The repaired recipe shows its plan, its picture, and the direction that its shape does not determine.
+    let good = FROM_NOTHING.replace("= 1500", "= 1.5").replace("trak_mm", "track_mm");
+    tab.read(&mut browser, &editor_text(&good));
+    tab.until(&mut browser, "document.querySelector('#plan .weak') && document.querySelector('#no-picture').hidden");
+    let weak = tab.read(&mut browser, "document.querySelector('#plan .weak').innerText");
+    assert!(weak.as_str().unwrap().contains("y position"), "{weak}");
+    // It is simulated, accepted and saved.
+    tab.click(&mut browser, "#simulate");
+    tab.until(&mut browser, "/(^|[^ T])ACCEPTED/.test(document.querySelector('#simulation .good')?.innerText) && !document.querySelector('#last-map').hidden");
+    tab.click(&mut browser, "#save");
+    tab.until(&mut browser, "document.querySelector('#version').innerText.endsWith(' 1')");
+    assert_eq!(std::fs::read_to_string(home.path().join("recipes/mirror.toml")).unwrap(), good);
+    assert_eq!(run(&["check", "recipes/mirror.toml"], home.path()).0, 0);
+    // Versions stand side by side.
+    tab.read(&mut browser, &editor_text(&good.replace("rows = 12", "rows = 18")));
+    tab.read(&mut browser, "(() => { const c = document.querySelector('#compared'); c.value = '1'; c.dispatchEvent(new Event('change')); })()");
+    tab.until(
+        &mut browser,
+        "document.querySelector('#texts').shadowRoot.querySelectorAll('.cm-changedLine').length === 2",
+    );
+    assert_eq!(tab.problems(&browser), Vec::<String>::new());
+}
+
+/// Nothing is wider than the screen, in each size and theme, with problems and without.
+#[test]
+#[ignore = "needs a browser: Debian package chromium"]
+fn workbench_fits_every_screen() {
+    let home = tempfile::tempdir().unwrap();
+    let (_page, url) = begin(home.path(), &[]);
+    let text = small_text(home.path());
+    let sizes: &[[u32; 2]] = if all() { &[[1920, 1080], [1366, 768], [390, 844]] } else { &[[1366, 768], [390, 844]] };
+    let languages: &[&str] = if all() { &["en", "de", "zh"] } else { &["de"] };
+    let place = url.split("/?").next().unwrap();
+    let mut browser = Browser::start(home.path());
+    for size in sizes {
+        let tab = browser.open(&url, *size);
+        tab.until(&mut browser, "document.querySelector('nav')");
+        for language in languages {
+            tab.read(&mut browser, &format!("document.cookie = 'regrind_language={language}; path=/'"));
+            tab.send(&mut browser, "Page.navigate", json!({ "url": format!("{place}/recipes/small.toml") }));
+            let is_shown = format!(
+                "document.documentElement.lang === '{language}' && window.regrindOpened && !document.querySelector('#simulate').disabled"
+            );
+            tab.until(&mut browser, &is_shown);
+            assert_fits(&tab, &mut browser, *size);
+            tab.read(&mut browser, &editor_text(&text.replace("track_mm", "trak_mm")));
+            tab.until(&mut browser, "document.querySelector('#problem-count').classList.contains('has-problems')");
+            // Only the lines on the screen are in the page.
+            tab.click(&mut browser, "#problem-count");
+            tab.until(&mut browser, &format!("{PROBLEMS}.length === 1"));
+            assert_fits(&tab, &mut browser, *size);
+            tab.read(&mut browser, &editor_text(&text));
+        }
+        assert_eq!(tab.problems(&browser), Vec::<String>::new());
+    }
+}
+
+fn assert_fits(tab: &Tab, browser: &mut Browser, size: [u32; 2]) {
+    let wrong = tab.read(
+        browser,
+        "(() => { const wrong = []; \
+         if (document.documentElement.scrollWidth > innerWidth) wrong.push(document.documentElement.scrollWidth); \
+         for (const e of document.querySelectorAll('main button, header button, select')) \
+         if (innerWidth < 500 && e.getClientRects().length && e.getBoundingClientRect().height < 43.5) wrong.push(e.outerHTML.slice(0, 80)); \
+         return wrong; })()",
+    );
+    assert_eq!(wrong, json!([]), "{size:?}");
+}
