@@ -159,7 +159,7 @@ impl RecipeFolder {
             return Err(FormatError::TooLarge { path, found, limit: Self::MAX_BYTES, unit: "bytes" });
         }
         ResultFolder::prepare(&folder)?.keep();
-        let _lock = SavingLock::take(&folder)?;
+        let _lock = SavingLock::acquire(&folder)?;
         let present = self.text(name)?;
         if present.as_deref() != replaces {
             return Err(FormatError::ChangedMeanwhile { path });
@@ -193,7 +193,7 @@ fn next(versions: &[RecipeVersion]) -> u32 {
 struct SavingLock(File);
 
 impl SavingLock {
-    fn take(folder: &Path) -> Result<Self, FormatError> {
+    fn acquire(folder: &Path) -> Result<Self, FormatError> {
         let path = folder.join("lock");
         let failed = |source| FormatError::Unwritable { path: path.clone(), action: "locking it", source };
         let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(failed)?;

@@ -59,7 +59,7 @@ pub use tls::{Tls, TlsError};
 pub use users::{PageRole, Person, Users, UsersError, UsersFile};
 pub use view::plant_document;
 pub use viewers::Viewers;
-pub use workbench::{RecipePrograms, Workbench};
+pub use workbench::state::{RecipePrograms, Workbench};
 
 use guard::Guard;
 use history::History;

@@ -7,7 +7,7 @@ use super::guard::Guard;
 use super::history::History;
 use super::live::RunWatcher;
 use super::viewers::Viewers;
-use super::workbench::Workbench;
+use super::workbench::state::Workbench;
 
 /// Source of what a run folder says of its run only together with the planning of Regrind. Each function takes the
 /// folder of the run, and returns `None` if the recipe, the cell file or the first record is missing or invalid.

@@ -19,7 +19,7 @@ use tokio::time::{Instant, timeout_at};
 
 use super::super::guard::{Session, foreign_origin};
 use super::super::shared::Shared;
-use super::{for_engineer, refused};
+use super::access::{for_engineer, refused};
 
 /// Maximum duration of the check and plan of one text.
 const MAX_DURATION: Duration = Duration::from_secs(120);

@@ -12,7 +12,7 @@ use tokio::task::spawn_blocking;
 
 use super::super::guard::{Session, foreign};
 use super::super::shared::Shared;
-use super::{for_engineer, plain, refused};
+use super::access::{for_engineer, plain, refused};
 
 /// Text that a browser saves.
 #[derive(Deserialize)]
@@ -48,6 +48,14 @@ pub(crate) async fn save(
     on_disk(workbench.recipes.clone(), move |recipes| recipes.save(&name, &text, replaces.as_deref(), [&by, &now]))
         .await
         .map_or_else(|response| response, |saved| Json(saved).into_response())
+}
+
+/// Serves the JSON schema of a recipe.
+pub(crate) async fn schema(State(page): State<Shared>, Extension(session): Extension<Session>) -> Response {
+    match for_engineer(&page, &session) {
+        Ok(workbench) => Json(workbench.programs.schema()).into_response(),
+        Err(response) => response,
+    }
 }
 
 /// Serves the present text of the recipe named `name`.

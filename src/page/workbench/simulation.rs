@@ -1,8 +1,6 @@
 //! Runs a recipe on simulated machines in a child program, and shows how it converges.
 
 use std::convert::Infallible;
-use std::path::PathBuf;
-use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -21,54 +19,21 @@ use regrind_language::Language;
 use regrind_report::ReportOptions;
 use serde::Deserialize;
 use serde_json::json;
-use tokio::io::AsyncReadExt;
-use tokio::process::{Child, Command};
-use tokio::sync::watch::{Receiver, Sender};
-use tokio::task::{AbortHandle, spawn_blocking};
+use tokio::task::spawn_blocking;
 
 use super::super::chart::chart;
 use super::super::guard::{Session, foreign};
-use super::super::history::History;
-use super::super::live::{ObservedRun, RunWatcher, verdict};
+use super::super::live::{ObservedRun, verdict};
 use super::super::pieces::figures;
 use super::super::shared::Shared;
 use super::super::view::language;
+use super::access::{for_engineer, refused};
+use super::running::{EndedSimulation, Simulation, started};
+use super::state::Workbench;
 use super::texts::WorkbenchText;
-use super::{Workbench, for_engineer, refused};
 
 /// Time between two looks at a simulation.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
-/// Maximum size of the messages of the child program that are kept, in bytes.
-const MAX_MESSAGE_BYTES: u64 = 4096;
-
-/// Run on simulated machines, and the child program that drives it.
-pub(super) struct Simulation {
-    /// Name of the recipe.
-    name: String,
-    seed: u64,
-    history: Arc<History>,
-    watcher: RunWatcher,
-    ended: Receiver<Option<EndedSimulation>>,
-    program: AbortHandle,
-    /// The folder is deleted with the last of its users.
-    _folder: Arc<SimulationFolder>,
-}
-
-impl Drop for Simulation {
-    fn drop(&mut self) {
-        self.program.abort();
-    }
-}
-
-/// End of the child program.
-#[derive(Clone, Debug, PartialEq, Eq)]
-struct EndedSimulation {
-    /// True if the program has made a run to its end, with an accepted part or not.
-    is_complete: bool,
-    /// Messages of the program.
-    message: String,
-}
-
 /// Text that is to be simulated.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -133,39 +98,6 @@ fn permitted<'p>(page: &'p Shared, session: &Session, headers: &HeaderMap) -> Re
     for_engineer(page, session)
 }
 
-/// Starts the child program `command`, which runs in `folder`.
-fn started(
-    mut command: Command,
-    name: String,
-    seed: u64,
-    folder: Arc<SimulationFolder>,
-) -> std::io::Result<Simulation> {
-    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).kill_on_drop(true);
-    let child = command.spawn()?;
-    let (end, ended) = tokio::sync::watch::channel(None);
-    let kept = Arc::clone(&folder);
-    let program = tokio::spawn(async move {
-        wait_for_end(child, end).await;
-        drop(kept);
-    });
-    let history = Arc::new(History::new(folder.runs()));
-    let watcher = RunWatcher::new(Arc::clone(&history));
-    Ok(Simulation { name, seed, history, watcher, ended, program: program.abort_handle(), _folder: folder })
-}
-
-/// Waits for the end of the child program, and tells it to `end`.
-async fn wait_for_end(mut child: Child, end: Sender<Option<EndedSimulation>>) {
-    let mut message = String::new();
-    if let Some(errors) = child.stderr.take() {
-        // A program that writes more is ended when the rest of its output has no reader.
-        let _ = errors.take(MAX_MESSAGE_BYTES).read_to_string(&mut message).await;
-    }
-    let status = child.wait().await.ok().and_then(|status| status.code());
-    let is_complete = matches!(status, Some(0 | 1));
-    // Nobody waits for it if the page has gone.
-    let _ = end.send(Some(EndedSimulation { is_complete, message: message.trim().to_owned() }));
-}
-
 /// Browser that shows a simulation.
 struct SimulationEvents {
     page: Shared,
@@ -205,7 +137,7 @@ impl SimulationEvents {
             if !self.page.guard.has_access(&self.session) {
                 return None;
             }
-            let (html, is_over) = self.look()?;
+            let (html, is_over) = self.current_pieces()?;
             if self.sent.as_ref() != Some(&(html.clone(), is_over)) {
                 let event = Event::default().json_data(json!({ "html": html, "isOver": is_over })).ok();
                 self.sent = Some((html, is_over));
@@ -216,7 +148,7 @@ impl SimulationEvents {
     }
 
     /// Returns the present HTML of the simulation, and true if it has ended. Returns `None` if there is none.
-    fn look(&self) -> Option<(String, bool)> {
+    fn current_pieces(&self) -> Option<(String, bool)> {
         let workbench = self.page.workbench.as_ref()?;
         let simulation = workbench.simulation();
         let simulation = simulation.as_ref().filter(|simulation| simulation.name == self.name)?;
@@ -225,18 +157,6 @@ impl SimulationEvents {
         // The record can be read a moment after the program has ended.
         let is_over = ended.as_ref().is_some_and(|ended| !ended.is_complete || verdict(&seen).is_some());
         Some((pieces(simulation, &seen, ended.as_ref(), self.language).into_string(), is_over))
-    }
-}
-
-impl Simulation {
-    /// Returns the folder of the run, when the child program has created it.
-    fn run_folder(&self) -> Option<PathBuf> {
-        self.history.first()
-    }
-
-    fn observed(&self) -> ObservedRun {
-        let folder = self.run_folder();
-        folder.map_or_else(ObservedRun::default, |folder| self.watcher.subscribe(&folder).borrow().clone())
     }
 }
 

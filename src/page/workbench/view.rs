@@ -21,8 +21,10 @@ use super::super::shared::Shared;
 use super::super::subject::PageSubject;
 use super::super::texts::{self, Text};
 use super::super::view::{harmless, language, not_here, plain_document, workbench_document};
+use super::access::refused;
+use super::saving;
+use super::state::Workbench;
 use super::texts::WorkbenchText;
-use super::{Workbench, refused, saving};
 
 /// Recipe in the list.
 struct ListedRecipe {
