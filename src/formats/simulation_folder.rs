@@ -20,7 +20,17 @@ impl SimulationFolder {
     pub fn create(text: &str) -> Result<Self, FormatError> {
         let home = std::env::temp_dir();
         let failed = |source| FormatError::Unwritable { path: home.clone(), action: "creating a folder in it", source };
-        let folder = Self(tempfile::Builder::new().prefix("regrind-").tempdir_in(&home).map_err(failed)?);
+        let mut builder = tempfile::Builder::new();
+        builder.prefix("regrind-");
+        // On Windows, the folder for temporary files is that of the user.
+        #[cfg(unix)]
+        let owner_only = {
+            use std::os::unix::fs::PermissionsExt;
+            std::fs::Permissions::from_mode(0o700)
+        };
+        #[cfg(unix)]
+        builder.permissions(owner_only);
+        let folder = Self(builder.tempdir_in(&home).map_err(failed)?);
         write_private(&folder.draft(), text.as_bytes())?;
         Ok(folder)
     }
