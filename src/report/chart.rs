@@ -47,6 +47,11 @@ pub struct ChartAxis {
     pub range: [f64; 2],
     /// Coordinate and text of each tick.
     pub ticks: Vec<(f64, String)>,
+    /// Times of the ticks, such as `2026-07-04T12:00:00Z`, for the scripts of a page, which show them in the time zone of
+    /// the reader; empty for an axis without times.
+    pub times: Vec<String>,
+    /// Parts of the times that the scripts show: `day`, `hour` (with the day) or `minute` (without it).
+    pub time_style: &'static str,
 }
 
 /// Formats a number with a number of decimals.
@@ -152,7 +157,7 @@ impl ChartAxis {
         let text = |(value, decimals): (f64, Option<usize>)| {
             (value, decimals.map_or_else(|| label_of_power(value), |decimals| number(value, decimals)))
         };
-        Self { label: label.to_owned(), scale, range, ticks: ticks.into_iter().map(text).collect() }
+        Self { label: label.to_owned(), scale, range, ticks: ticks.into_iter().map(text).collect(), ..Self::default() }
     }
 
     /// Creates a linear axis from the integer `first` to `last`, with half a step more at both ends. Its ticks are the
@@ -164,7 +169,7 @@ impl ChartAxis {
         let is_tick = |at: &u32| (*at as usize).is_multiple_of(step);
         let ticks = (first..=last.max(first)).filter(is_tick).map(|at| (f64::from(at), at.to_string())).collect();
         let range = [f64::from(first) - 0.5, f64::from(last.max(first)) + 0.5];
-        Self { label: label.to_owned(), scale: Scale::Linear, range, ticks }
+        Self { label: label.to_owned(), scale: Scale::Linear, range, ticks, ..Self::default() }
     }
 
     fn ruler(&self, pixels: [f64; 2]) -> Ruler {
@@ -271,10 +276,13 @@ impl Chart {
             out.line("grid", [left, y], [right, y]);
             out.text("tick", [left - 6.0, y + 4.0], "end", text);
         }
-        for (value, text) in &self.x.ticks {
+        for (k, (value, text)) in self.x.ticks.iter().enumerate() {
             let x = area.x.pixel(*value);
             out.line("grid", [x, bottom], [x, bottom + 4.0]);
-            out.text("tick", [x, bottom + 17.0], "middle", text);
+            match self.x.times.get(k) {
+                Some(time) => out.time([x, bottom + 17.0], text, time, self.x.time_style),
+                None => out.text("tick", [x, bottom + 17.0], "middle", text),
+            }
         }
         out.line("grid", [left, bottom], [right, bottom]);
         if !self.x.label.is_empty() {
@@ -443,6 +451,14 @@ impl Output {
         ));
     }
 
+    /// Draws the text of a tick at a time.
+    fn time(&mut self, [x, y]: [f64; 2], text: &str, time: &str, style: &str) {
+        let (text, time) = (escaped(text), attribute(time));
+        self.put(format_args!(
+            "<text class=\"tick\" x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"middle\" data-time=\"{time}\" data-style=\"{style}\">{text}</text>\n"
+        ));
+    }
+
     fn shape(&mut self, shape: Shape, [x, y]: [f64; 2], tooltip: &str) {
         let title = tooltip_element(tooltip);
         let (class, outline) = match shape {
@@ -508,6 +524,16 @@ mod tests {
         ] {
             assert!(svg.contains(piece), "{piece}: {svg}");
         }
+    }
+
+    #[test]
+    fn ticks_have_their_times() {
+        let ticks = vec![(1.0, "07-04".to_owned()), (3.0, "07-05".to_owned())];
+        let times = vec!["2026-07-04T12:00:00Z".to_owned(), "2026-07-05\"".to_owned()];
+        let x = ChartAxis { range: [0.5, 3.5], ticks, times, time_style: "day", ..ChartAxis::default() };
+        let svg = Chart { x, ..chart(Vec::new()) }.to_markup();
+        assert!(svg.contains("x=\"68.7\" y=\"89.0\" text-anchor=\"middle\" data-time=\"2026-07-04T12:00:00Z\" data-style=\"day\">07-04<"), "{svg}");
+        assert!(svg.contains("data-time=\"2026-07-05&quot;\""), "{svg}");
     }
 
     #[test]
