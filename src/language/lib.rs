@@ -5,6 +5,7 @@
 //! ```
 
 use std::collections::{BTreeMap, HashMap};
+use std::fmt::Display;
 use std::sync::LazyLock;
 
 use regrind_cell::AlarmId;
@@ -60,6 +61,8 @@ pub enum Section {
     Report,
     /// Texts of the page on which recipes are written.
     Workbench,
+    /// Texts of the page of a plant. Those that it shares with the page of a cell are in that section.
+    Plant,
 }
 
 /// Makes an enum of texts, with the section in which the files of the languages have them.
@@ -115,6 +118,9 @@ struct Catalogue {
     /// Texts of the page on which recipes are written. The keys have the names of the variants of `WorkbenchText`.
     #[serde(default)]
     workbench: HashMap<String, String>,
+    /// Texts of the page of a plant. The keys have the names of the variants of its `Text`.
+    #[serde(default)]
+    plant: HashMap<String, String>,
     #[serde(default)]
     alarms: BTreeMap<AlarmId, AlarmEntry>,
 }
@@ -122,7 +128,7 @@ struct Catalogue {
 impl Catalogue {
     fn read(text: &str) -> Result<Self, toml::de::Error> {
         let mut catalogue: Self = toml::from_str(text)?;
-        for section in [&mut catalogue.page, &mut catalogue.report, &mut catalogue.workbench] {
+        for section in [&mut catalogue.page, &mut catalogue.report, &mut catalogue.workbench, &mut catalogue.plant] {
             *section = section.drain().map(|(key, text)| (variant_name(&key), text)).collect();
         }
         Ok(catalogue)
@@ -149,11 +155,12 @@ impl Language {
     pub fn text(self, section: Section, name: &str) -> &'static str {
         let catalogue = self.catalogue();
         let texts = match section {
-            Section::Page => &catalogue.page,
-            Section::Report => &catalogue.report,
-            Section::Workbench => &catalogue.workbench,
+            Section::Page => catalogue.page.get(name),
+            Section::Report => catalogue.report.get(name),
+            Section::Workbench => catalogue.workbench.get(name),
+            Section::Plant => catalogue.plant.get(name).or_else(|| catalogue.page.get(name)),
         };
-        texts.get(name).map_or("", String::as_str)
+        texts.map_or("", String::as_str)
     }
 
     /// Returns the texts of an alarm. Returns `None` if the language has none: then the texts of the record are used.
@@ -170,6 +177,29 @@ impl Language {
             Self::ALL.iter().copied().find(|language| language.tag() == primary)
         })
     }
+}
+
+/// Returns `text` with each place `{name}` replaced by the value of that name. A place without a value stays as it is, and
+/// braces in a value are no places.
+pub fn filled(text: &str, values: &[(&str, &dyn Display)]) -> String {
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(at) = rest.find('{') {
+        let (before, from) = rest.split_at(at);
+        out.push_str(before);
+        let end = from.find('}').unwrap_or(0);
+        match values.iter().find(|(name, _)| end > 0 && from[1..end] == **name) {
+            Some((_, value)) => {
+                out.push_str(&value.to_string());
+                rest = &from[end + 1..];
+            }
+            None => {
+                out.push('{');
+                rest = &from[1..];
+            }
+        }
+    }
+    out + rest
 }
 
 /// Formats a number with the given number of decimals, and with the decimal sign of `language`.
@@ -191,16 +221,24 @@ pub fn shortest(value: f64, language: Language) -> String {
 mod tests {
     use super::*;
 
+    /// Returns the names of the places for values in a text, sorted.
+    fn places(text: &str) -> Vec<&str> {
+        let mut places: Vec<&str> = text.split('{').skip(1).filter_map(|rest| Some(rest.split_once('}')?.0)).collect();
+        places.sort_unstable();
+        places
+    }
+
     #[test]
     fn every_language_has_every_text() {
         let english = Catalogue::read(Language::En.file()).unwrap();
         for language in Language::ALL {
             let read = Catalogue::read(language.file()).unwrap_or_else(|error| panic!("{language:?}: {error}"));
-            for (english, read) in
-                [(&english.page, &read.page), (&english.report, &read.report), (&english.workbench, &read.workbench)]
-            {
-                for key in english.keys() {
+            let sections =
+                |of: &Catalogue| [of.page.clone(), of.report.clone(), of.workbench.clone(), of.plant.clone()];
+            for (english, read) in sections(&english).iter().zip(&sections(&read)) {
+                for (key, text) in english {
                     assert!(read.get(key).is_some_and(|text| !text.trim().is_empty()), "{language:?} has no {key}");
+                    assert_eq!(places(&read[key]), places(text), "{language:?}: the places of {key}");
                 }
                 for key in read.keys() {
                     assert!(english.contains_key(key), "{language:?}: {key} is in no other language");
@@ -215,6 +253,14 @@ mod tests {
         for (key, name) in [("cell", "Cell"), ("not_connected", "NotConnected"), ("", ""), ("a__b", "AB")] {
             assert_eq!(variant_name(key), name);
         }
+    }
+
+    #[test]
+    fn values_fill_their_places() {
+        let values: [(&str, &dyn Display); 2] = [("a", &"{b}"), ("b", &7)];
+        assert_eq!(filled("{b} of {a}, {c} {", &values), "7 of {b}, {c} {");
+        assert_eq!(filled("单元 {a}}", &values), "单元 {b}}");
+        assert_eq!(filled("", &[]), "");
     }
 
     #[test]

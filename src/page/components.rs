@@ -9,8 +9,9 @@ use regrind_report::{Chart, ChartAxis, Dot, Layer, Mark, Scale, Shape};
 
 use super::gauge::gauge;
 use super::guard::Session;
+use super::reader::language;
 use super::texts::Text;
-use super::view::{language, plain_document};
+use super::view::plain_document;
 use regrind_language::{Language, decimal};
 
 /// Colours of the look by their names in the style sheet, with their meanings.

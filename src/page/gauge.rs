@@ -9,7 +9,7 @@ use regrind_language::{Language, decimal};
 
 /// Returns the HTML of a figure. `value_um` has the figure and its expanded uncertainty, in micrometres. `limit_um` is
 /// the limit, if there is one. The bar begins at 0.
-pub(crate) fn gauge(
+pub fn gauge(
     name: &str,
     [value_um, expanded_um]: [f64; 2],
     limit_um: Option<f64>,

@@ -27,6 +27,7 @@ mod orders;
 mod parts_view;
 mod pieces;
 mod rate;
+mod reader;
 mod record_view;
 mod sessions;
 mod settings_view;
@@ -51,8 +52,10 @@ use axum::extract::DefaultBodyLimit;
 use axum::routing::{get, post};
 use tokio::net::TcpListener;
 
+pub use gauge::gauge;
 pub use guard::{Entrance, Session};
 pub use guarded_server::GuardedServer;
+pub use reader::Reader;
 pub use shared::{Equipment, Page, RunPlan};
 pub use subject::PageSubject;
 pub use tls::{Tls, TlsError};

@@ -12,10 +12,11 @@ use tokio::task::spawn_blocking;
 
 use super::guard::Session;
 use super::pieces::in_path;
+use super::reader::language;
 use super::shared::{Equipment, Shared};
 use super::subject::PageSubject;
 use super::texts::Text;
-use super::view::{first_run, language, not_here, plain_document};
+use super::view::{first_run, not_here, plain_document};
 use regrind_language::{Language, decimal};
 
 /// Width and height of the chart of a value, in pixels.

@@ -14,10 +14,11 @@ use tokio::task::spawn_blocking;
 use super::guard::Session;
 use super::history::Listed;
 use super::pieces::{in_path, when};
+use super::reader::language;
 use super::shared::Shared;
 use super::subject::PageSubject;
 use super::texts::{self, Text};
-use super::view::{language, not_here, plain_document};
+use super::view::{not_here, plain_document};
 use regrind_language::{Language, decimal};
 
 /// Serves the list of the parts with a serial number, from the one that was made last.

@@ -12,10 +12,11 @@ use tokio::task::spawn_blocking;
 
 use super::guard::Session;
 use super::pieces::{in_path, when};
+use super::reader::language;
 use super::shared::Shared;
 use super::subject::PageSubject;
 use super::texts::Text;
-use super::view::{language, not_here, plain_document};
+use super::view::{not_here, plain_document};
 use regrind_language::Language;
 
 /// Number of records on a page.

@@ -8,9 +8,10 @@ use axum::response::Response;
 use maud::html;
 
 use super::guard::Session;
+use super::reader::language;
 use super::shared::Shared;
 use super::texts::{self, Text};
-use super::view::{THEMES, language, plain_document};
+use super::view::{THEMES, plain_document};
 use regrind_language::Language;
 
 /// Serves the settings. The list of the users is for engineers only.

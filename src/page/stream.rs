@@ -15,6 +15,7 @@ use tokio::sync::watch::Receiver;
 use super::guard::Session;
 use super::live::ObservedRun;
 use super::pieces::{Piece, run_pieces};
+use super::reader::language;
 use super::shared::Shared;
 use super::view;
 use super::viewers::Viewer;
@@ -44,7 +45,7 @@ pub(crate) async fn events(
 ) -> Response {
     let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
     let seen = page.run_watcher.subscribe(&folder);
-    let language = view::language(&headers);
+    let language = language(&headers);
     let _viewer = page.viewers.enter();
     let looking = RunEventStream { page, session, language, run: seen, sent: Vec::new(), is_first: true, _viewer };
     let stream = unfold(looking, |mut looking| async {

@@ -15,7 +15,7 @@ regrind_language::texts! {
     // The frame of the page.
     Cell Runs Parts Recipes Machines Settings Components Record ShiftLog Events NewEntry AddEntry Time Who Kind What Older RecordIntact SignedUpTo NotSigned RecordBroken
     Compare Language Appearance AsTheSystem Light Dark HighContrast SkipToOrders Simulation
-    NotConnected ProgramGone SimulationGone PageGone
+    NotConnected ProgramGone SimulationGone PageGone Plant Trend PlantGone
     // Texts about the part.
     Part Recipe Cycle OfAtMost Operator Run Began Ended Since Until Result Alarms
     // Steps of a cycle.

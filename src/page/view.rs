@@ -3,7 +3,7 @@
 
 use axum::Extension;
 use axum::extract::{Path, Query, State};
-use axum::http::header::{ACCEPT_LANGUAGE, CONTENT_TYPE, COOKIE};
+use axum::http::header::CONTENT_TYPE;
 use axum::http::{HeaderMap, HeaderName, StatusCode};
 use axum::response::{IntoResponse, Redirect, Response};
 use data_encoding::HEXLOWER;
@@ -19,10 +19,11 @@ use serde_json::{Value, json};
 use tokio::task::spawn_blocking;
 
 use super::chart::chart;
-use super::guard::{Denied, Session, text};
+use super::guard::{Denied, Session};
 use super::history::Listed;
 use super::live::{ObservedRun, verdict};
 use super::pieces::{Piece, about, banner, figures, in_path, is_over, lacks_reason, run_pieces, verdict_reason, when};
+use super::reader::{Reader, language};
 use super::shared::Shared;
 use super::subject::PageSubject;
 use super::texts::{self, Text};
@@ -558,15 +559,23 @@ impl Kind<'_> {
             Self::Plant { .. } => PageSubject::Plant,
         }
     }
+
+    /// Returns the time in milliseconds after which a browser fetches the content of a page of the plant again.
+    fn refresh_ms(self) -> Option<u32> {
+        match self {
+            Self::Plant { again_s, .. } => again_s.map(|seconds| 1000 * seconds),
+            _ => None,
+        }
+    }
 }
 
 /// Returns a complete web page of the plant. `main` is the content. The function adds the parts that all pages have:
-/// the title `title`, the links at the top, and the person who has signed in (from `session`). The browser reloads the
-/// page every `again_s` seconds. If `again_s` is `None`, it does not reload the page. `style` is the address of an
+/// the title `title`, the links at the top, and the person who has signed in, in the language of `reader`. The browser
+/// fetches the content again every `again_s` seconds; if `again_s` is `None`, it does not. `style` is the address of an
 /// additional style sheet.
-pub fn plant_document(title: &str, session: &Session, again_s: Option<u32>, style: &str, main: Markup) -> Response {
+pub fn plant_document(title: &str, reader: &Reader, again_s: Option<u32>, style: &str, main: Markup) -> Response {
     let kind = Kind::Plant { again_s, style };
-    document(title, &Frame { language: Language::En, person: session.person.as_ref(), kind }, main)
+    document(title, &Frame { language: reader.language, person: reader.session.person.as_ref(), kind }, main)
 }
 
 fn document(title: &str, frame: &Frame, main: Markup) -> Response {
@@ -583,11 +592,12 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                 link rel="stylesheet" href="/assets/page.css";
                 @if let Kind::Plant { again_s, style } = kind {
                     link rel="stylesheet" href=(style);
-                    @if let Some(again_s) = again_s { meta http-equiv="refresh" content=(again_s); }
+                    // With scripts the content is replaced in its place: what is open stays open.
+                    @if let Some(again_s) = again_s { noscript { meta http-equiv="refresh" content=(again_s); } }
                 }
                 script src="/assets/theme.js" {}
                 script src="/assets/post.js" defer {}
-                @if matches!(kind, Kind::Plain(PageSubject::Cell)) { script src="/assets/refresh.js" defer {} }
+                @if matches!(kind, Kind::Plain(PageSubject::Cell) | Kind::Plant { .. }) { script src="/assets/refresh.js" defer {} }
                 @if matches!(kind, Kind::Workbench) {
                     link rel="stylesheet" href="/assets/workbench.css";
                     script src="/assets/codemirror.js" defer {}
@@ -600,13 +610,13 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                     script src="/assets/page.js" defer {}
                 }
             }
-            body {
+            body data-refresh-ms=[kind.refresh_ms()] {
                 nav {
                     span .brand { "Regrind" }
                     @match kind.subject() {
                         PageSubject::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } " " a href="/parts" { (say(Text::Parts)) } " " a href="/recipes" { (say(Text::Recipes)) } " " a href="/machines" { (say(Text::Machines)) } " " a href="/settings" { (say(Text::Settings)) } }
                         PageSubject::Plant => {
-                            @for (path, name) in [("/", "Plant"), ("/trend", "Trend"), ("/cells", "Compare"), ("/parts", "Parts")] { a href=(path) { (name) } " " }
+                            @for (path, name) in [("/", Text::Plant), ("/trend", Text::Trend), ("/cells", Text::Compare), ("/parts", Text::Parts)] { a href=(path) { (say(name)) } " " }
                         }
                     }
                     span .settings {
@@ -614,16 +624,14 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                             span .person { (person.name) " · " (say(texts::role(person.role))) } " "
                             button #sign-out type="button" { (say(Text::SignOut)) } " "
                         }
-                        @if !matches!(kind, Kind::Plant { .. }) {
-                            label { (say(Text::Language)) " "
-                                select #language {
-                                    @for &each in Language::ALL {
-                                        option value=(each.tag()) lang=(each.tag()) selected[each == language] { (each.name()) }
-                                    }
+                        label { (say(Text::Language)) " "
+                            select #language {
+                                @for &each in Language::ALL {
+                                    option value=(each.tag()) lang=(each.tag()) selected[each == language] { (each.name()) }
                                 }
                             }
-                            " "
                         }
+                        " "
                         label { (say(Text::Appearance)) " "
                             select #theme {
                                 @for (value, text) in THEMES {
@@ -633,23 +641,10 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                         }
                     }
                 }
+                @if kind.refresh_ms().is_some() { p #lost role="alert" hidden { (say(Text::PlantGone)) } }
                 (main)
             }
         }
     };
     ([(CONTENT_TYPE, "text/html; charset=utf-8")], markup.into_string()).into_response()
-}
-
-/// Returns the language of the page for a request. `headers` are the headers of the request. The first rule that gives
-/// a language applies:
-///
-/// - the language that the person chose in this browser (stored in a cookie)
-/// - the first supported language in the header `Accept-Language`
-/// - English
-pub(crate) fn language(headers: &HeaderMap) -> Language {
-    let chosen = text(headers, COOKIE).and_then(|cookies| {
-        let pair = cookies.split(';').find_map(|pair| pair.trim().strip_prefix("regrind_language="))?;
-        Language::first_of(pair)
-    });
-    chosen.or_else(|| Language::first_of(text(headers, ACCEPT_LANGUAGE)?)).unwrap_or_default()
 }

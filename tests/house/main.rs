@@ -33,7 +33,7 @@ const ARROWS: [(&str, &str, &[&str]); 29] = [
     ("config", "src/config", &["device", "document", "formats", "geometry", "model"]),
     ("trust", "src/trust", &["formats"]),
     ("live", "src/live", &["cell", "control", "document", "formats", "trust"]),
-    ("plant", "src/plant", &["document", "formats", "journal", "page", "report", "trust"]),
+    ("plant", "src/plant", &["document", "formats", "journal", "language", "page", "report", "trust"]),
     ("record", "src/record", &["cell", "formats", "journal"]),
     ("language", "src/language", &["cell"]),
     (

@@ -8,6 +8,19 @@ function regrindTimes(within) {
     time.title = time.title || time.textContent;
     time.textContent = at.toLocaleString(document.documentElement.lang, { dateStyle: "medium", timeStyle: "medium" });
   }
+  // Times in pictures: the ticks of an axis, and times within the text at a point.
+  const styles = { date: { dateStyle: "short" }, day: { month: "2-digit", day: "2-digit" }, hour: { month: "2-digit", day: "2-digit", hour: "2-digit", minute: "2-digit" }, minute: { hour: "2-digit", minute: "2-digit" } };
+  for (const tick of within.querySelectorAll("text[data-time]")) {
+    const at = new Date(tick.dataset.time);
+    if (!Number.isNaN(at.getTime())) tick.textContent = at.toLocaleString(document.documentElement.lang, styles[tick.dataset.style] || styles.hour);
+  }
+  for (const title of within.querySelectorAll("svg.chart title")) {
+    title.textContent = title.textContent.replace(/(\d{4}-\d\d-\d\d) (\d\d:\d\d:\d\d) UTC/, (utc, day, time) => {
+      const at = new Date(`${day}T${time}Z`);
+      return Number.isNaN(at.getTime()) ? utc : at.toLocaleString(document.documentElement.lang, { dateStyle: "medium", timeStyle: "medium" });
+    });
+  }
+  for (const zone of within.querySelectorAll("[data-zone]")) zone.textContent = zone.dataset.zone;
 }
 (() => {
   const theme = localStorage.getItem("regrind-theme");

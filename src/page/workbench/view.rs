@@ -17,10 +17,11 @@ use tokio::task::spawn_blocking;
 
 use super::super::guard::Session;
 use super::super::pieces::{in_path, when};
+use super::super::reader::language;
 use super::super::shared::Shared;
 use super::super::subject::PageSubject;
 use super::super::texts::{self, Text};
-use super::super::view::{harmless, language, not_here, plain_document, workbench_document};
+use super::super::view::{harmless, not_here, plain_document, workbench_document};
 use super::access::refused;
 use super::saving;
 use super::state::Workbench;

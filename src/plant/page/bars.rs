@@ -1,7 +1,10 @@
 //! Bars of parts per day: accepted at the first measurement, accepted after a correction, and not accepted.
 
 use maud::{Markup, PreEscaped, html};
+use regrind_language::{Language, filled};
 use regrind_report::{Chart, ChartAxis, Layer, Mark, Scale};
+
+use super::texts::Text;
 
 /// Width and height of the chart in pixels.
 const SIZE: [f64; 2] = [640.0, 190.0];
@@ -24,12 +27,14 @@ pub(super) struct Count {
 }
 
 /// Draws a bar for each day, with the numbers of parts that were accepted at the first measurement, accepted later, and
-/// not accepted.
-pub(super) fn bars(days: &[Day]) -> Markup {
+/// not accepted. The bars begin at 0, because their heights are numbers of parts.
+pub(super) fn bars(days: &[Day], language: Language) -> Markup {
     let most = days.iter().map(|day| day.count.ended).max().unwrap_or(0).max(1) as f64;
     let told = |day: &Day| {
         let Count { ended, accepted, at_once } = day.count;
-        format!("{}: {ended} ended, {accepted} accepted, {at_once} at the first measurement", day.day)
+        let values: [(&str, &dyn std::fmt::Display); 4] =
+            [("day", &day.day), ("ended", &ended), ("accepted", &accepted), ("at_once", &at_once)];
+        filled(Text::DayOfParts.to(language), &values)
     };
     let marks = days.iter().enumerate().flat_map(|(k, day)| {
         let (Count { ended, accepted, at_once }, x) = (day.count, k as f64);
@@ -57,10 +62,14 @@ pub(super) fn bars(days: &[Day]) -> Markup {
         ..Chart::default()
     };
     html! {
-        (PreEscaped(chart.to_markup()))
-        p .legend {
-            span .key .at-once {} " accepted at the first measurement " span .key .accepted {} " accepted after corrections "
-            span .key .other {} " not accepted, stopped or aborted"
+        div {
+            div .wide .newest { (PreEscaped(chart.to_markup())) }
+            p .legend {
+                @for (class, text) in [("at-once", Text::AcceptedAtOnce), ("accepted", Text::AcceptedLater), ("other", Text::NotAcceptedAny)] {
+                    span { span .key .(class) {} " " (text.to(language)) } " "
+                }
+                (Text::DaysOfUtc.to(language))
+            }
         }
     }
 }
@@ -72,7 +81,7 @@ mod tests {
     #[test]
     fn bar_heights_match_counts() {
         let day = |ended, accepted, at_once| Day { day: "07-04".into(), count: Count { ended, accepted, at_once } };
-        let svg = bars(&[day(0, 0, 0), day(10, 8, 2)]).into_string();
+        let svg = bars(&[day(0, 0, 0), day(10, 8, 2)], Language::En).into_string();
         assert_eq!(svg.matches("<rect").count(), 3, "{svg}");
         let heights: Vec<f64> = svg
             .split("<rect")
@@ -83,6 +92,6 @@ mod tests {
             (heights[0] / heights[1] - 2.0 / 6.0).abs() < 0.01 && (heights[2] / heights[1] - 2.0 / 6.0).abs() < 0.01,
             "{heights:?}"
         );
-        assert!(!bars(&[]).into_string().contains("NaN"));
+        assert!(!bars(&[], Language::En).into_string().contains("NaN"));
     }
 }

@@ -1,26 +1,31 @@
 //! `/cells`: comparison of the cells for one recipe: the results of their parts, and whether a difference is more than
 //! chance.
 
-use axum::Extension;
 use axum::extract::{Query, RawQuery, State};
 use axum::response::Response;
 use maud::{Markup, html};
 use regrind_figures::statistics::quantile;
-use regrind_page::Session;
+use regrind_language::{Language, decimal, filled};
+use regrind_page::Reader;
 
 use super::super::ToSql;
 use super::super::error::PlantError;
 use super::super::link::DatabaseLink;
 use super::content::{PageContent, page};
+use super::cycle_counts::CycleCounts;
+use super::natural::natural_order;
 use super::page_error::PageError;
 use super::rank::{ENOUGH, holm, rank_sum};
 use super::selection::{NEWEST_FIRST, Selection, SelectionQuery, mark};
 use super::shared::Shared;
-use super::words::{encoded, interval, share, shown, um};
+use super::texts::Text;
+use super::words::{encoded, interval, name, share, um};
 
 /// Maximum number of cells compared at once, and of parts of each cell (the newest).
 const CELLS: usize = 40;
 const PARTS: i64 = 200;
+/// Maximum number of cells of a plant.
+const MAX_CELLS: i64 = 5000;
 /// Significance level: a smaller probability is reported as more than chance.
 const CHANCE: f64 = 0.05;
 
@@ -30,7 +35,8 @@ struct Cell {
     name: String,
     /// PV of the parts, in µm, in ascending order.
     pv_um: Vec<f64>,
-    cycles: Vec<i32>,
+    /// Cycles of the accepted parts.
+    cycles: CycleCounts,
     ended: i64,
     accepted: i64,
     at_once: i64,
@@ -38,18 +44,25 @@ struct Cell {
 
 pub(super) async fn cells(
     State(plant): State<Shared>,
-    Extension(session): Extension<Session>,
+    reader: Reader,
     Query(asked): Query<SelectionQuery>,
     RawQuery(query): RawQuery,
 ) -> Response {
     let after = query.as_deref().unwrap_or_default().split('&').find_map(|pair| pair.strip_prefix("after="));
-    page(&session, made(&plant, &asked, after.and_then(|after| after.parse().ok()).unwrap_or(0))).await
+    let after = after.and_then(|after| after.parse().ok()).unwrap_or(0);
+    page(&reader, made(&plant, &asked, after, reader.language)).await
 }
 
-async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<PageContent, PageError> {
+async fn made(
+    plant: &Shared,
+    asked: &SelectionQuery,
+    after: usize,
+    language: Language,
+) -> Result<PageContent, PageError> {
+    let say = |text: Text| text.to(language);
     let link = plant.lease().await?;
     let selection = Selection::from_query(&link, asked).await?;
-    let form = selection.form(&link, "/cells", &["recipe", "grinder", "cmm", "wheel", "probe"]).await?;
+    let form = selection.form(&link, "/cells", &["recipe", "grinder", "cmm", "wheel", "probe"], language).await?;
     let mut cells = read(&link, &selection, after).await?;
     let more = cells.len() > CELLS;
     cells.truncate(CELLS);
@@ -57,43 +70,42 @@ async fn made(plant: &Shared, asked: &SelectionQuery, after: usize) -> Result<Pa
     let chances = chances(&cells);
     let main = html! {
         main .list .plant {
-            h1 { "Cells compared " (mark(selection.simulated)) }
+            h1 { (say(Text::CellsCompared)) " " (mark(selection.simulated)) }
             (form)
-            p .quiet { (selection.words()) ", of each cell the newest " (PARTS) " at most." }
+            p .quiet { (filled(say(Text::OfEachCellNewest), &[("selection", &selection.words(language)), ("count", &PARTS)])) }
             @if selection.recipe().is_empty() {
-                p .no { "Parts of several recipes are compared: a difference between cells can come from their recipes. Choose a recipe." }
+                p .warns { (say(Text::RecipesCompared)) }
             }
-            @if cells.is_empty() { p { "No cell has made such a part." } } @else { div .wide { (table(&cells, &chances, &selection)) } }
-            @if more { p { a href=(format!("/cells?{}&after={}", selection.query(), after + CELLS)) { "Further cells" } } }
-            p .quiet {
-                "The last column compares the PV of a cell with those of all other cells that are shown: rank-sum test of Mann and Whitney (two-sided, at \
-                 least " (ENOUGH) " parts in each group), p-value corrected for the number of cells (Holm-Bonferroni). A p-value below "
-                (format!("{:.0} %", 100.0 * CHANCE)) " is reported as more than chance. The test assumes independent parts: a drift within a cell looks like a \
-                 difference too. The box shows the middle half of the values, its line the median; the whiskers reach from the minimum to the maximum."
-            }
+            @if cells.is_empty() { p { (say(Text::NoCellMadeSuch)) } } @else { div .wide { (table(&cells, &chances, &selection, language)) } }
+            @if more { p { a href=(format!("/cells?{}&after={}", selection.query(), after + CELLS)) { (say(Text::FurtherCells)) } } }
+            p .quiet { (filled(say(Text::TestOfCells), &[("parts", &ENOUGH), ("chance", &format!("{:.0} %", 100.0 * CHANCE))])) }
         }
     };
-    Ok(PageContent { title: "Cells".into(), again_s: None, main })
+    Ok(PageContent { title: say(Text::CellsCompared).into(), again_s: None, main })
 }
 
-/// Reads the newest runs that ended, or whose part was given up, and that match `selection`, at most `PARTS` runs for each cell. The cells are sorted by
-/// name. The first `after` cells are skipped. Retired cells are not included. Returns at most `CELLS` + 1 cells. A page
+/// Reads the newest runs that ended, or whose part was given up, and that match `selection`, at most `PARTS` runs for each cell. The cells are in the
+/// natural order of their names. The first `after` cells are skipped. Retired cells are not included. Returns at most `CELLS` + 1 cells. A page
 /// shows only `CELLS` cells; if there is one more, the caller knows that a next page exists. The PV values of each cell
 /// are sorted in ascending order.
 async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Result<Vec<Cell>, PlantError> {
+    let rows =
+        link.query("SELECT id, name FROM cell WHERE retired_at IS NULL ORDER BY name LIMIT $1", &[&MAX_CELLS]).await?;
+    let mut named: Vec<(i32, String)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
+    named.sort_by(|(_, a), (_, b)| natural_order(a, b));
     let (condition, values) = selection.condition_within_cell();
     let n = values.len();
     // Reads one cell at a time, each from the end of its own index.
     let text = format!(
-        "SELECT c.name, p.pv_um, p.cycles, p.result, p.given_up FROM (SELECT id, name FROM cell WHERE retired_at IS NULL ORDER BY name LIMIT ${} OFFSET ${}) c
+        "SELECT c.name, p.pv_um, p.cycles, p.result, p.given_up FROM unnest(${}::integer[], ${}::text[]) WITH ORDINALITY AS c (id, name, place)
             LEFT JOIN LATERAL (SELECT pv_um, cycles, result, given_up FROM part_run WHERE cell_id = c.id AND (ended IS NOT NULL OR given_up) AND {condition}
-                ORDER BY {NEWEST_FIRST} LIMIT {PARTS}) p ON true ORDER BY c.name",
+                ORDER BY {NEWEST_FIRST} LIMIT {PARTS}) p ON true ORDER BY c.place",
         n + 1,
         n + 2
     );
-    let (most, after) = (CELLS as i64 + 1, after as i64);
+    let (ids, names): (Vec<i32>, Vec<String>) = named.into_iter().skip(after).take(CELLS + 1).unzip();
     let mut given: Vec<&(dyn ToSql + Sync)> = values.iter().map(|value| value as &(dyn ToSql + Sync)).collect();
-    given.extend([&most as &(dyn ToSql + Sync), &after]);
+    given.extend([&ids as &(dyn ToSql + Sync), &names]);
     let mut cells: Vec<Cell> = Vec::new();
     for row in link.query(&text, &given).await? {
         let name: String = row.get(0);
@@ -112,7 +124,7 @@ async fn read(link: &DatabaseLink, selection: &Selection, after: usize) -> Resul
         let is_finished = matches!(result, "accepted" | "not accepted");
         cell.accepted += i64::from(result == "accepted");
         cell.at_once += i64::from(result == "accepted" && cycles == Some(1));
-        cell.cycles.extend(cycles.filter(|_| is_finished));
+        cell.cycles.add(i64::from(cycles.unwrap_or_default()), i64::from(result == "accepted"));
         cell.pv_um.extend(row.get::<_, Option<f64>>(1).filter(|um| is_finished && um.is_finite()));
     }
     for cell in &mut cells {
@@ -138,42 +150,48 @@ fn chances(cells: &[Cell]) -> Vec<Option<f64>> {
     holm(&found)
 }
 
-fn table(cells: &[Cell], chances: &[Option<f64>], selection: &Selection) -> Markup {
+fn table(cells: &[Cell], chances: &[Option<f64>], selection: &Selection, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
     let all = || cells.iter().flat_map(|cell| cell.pv_um.iter().copied());
     let scale = [all().fold(f64::INFINITY, f64::min), all().fold(0.0, f64::max)];
-    let mean = |cycles: &[i32]| cycles.iter().map(|n| f64::from(*n)).sum::<f64>() / cycles.len() as f64;
+    let [from, to] = scale.map(|end| um(Some(end), 2, language));
     html! {
         table .compared {
             tr {
-                th { "Cell" } th .n { "n" } th .n { "median PV, µm" } th { "PV, " (um(Some(scale[0]), 2)) " to " (um(Some(scale[1]), 2)) " µm" } th .n { "yield" } th .n { "first pass" }
-                th .n { "95 %" } th .n { "cycles a part" } th { "differs from the others" }
+                th { (say(Text::Cell)) } th .n { "n" } th .n { (say(Text::MedianPv)) } th { (filled(say(Text::PvFromTo), &[("from", &from), ("to", &to)])) }
+                th .n { (say(Text::Yield)) } th .n { (say(Text::CyclesAPart)) } th { "1 · 2 · 3 · 4 · 5+" } th .n { (say(Text::FirstPassYield)) } th .n { "95 %" } th { (say(Text::DiffersFromOthers)) }
             }
             @for (cell, chance) in cells.iter().zip(chances) {
                 tr data-cell=(cell.name) {
-                    td { a href=(format!("/trend?{}&cell={}", selection.query(), encoded(&cell.name))) { (shown(&cell.name)) } }
-                    td .n { (cell.ended) } td .n { strong { (um(quantile(&cell.pv_um, 0.5), 3)) } }
+                    td { a href=(format!("/trend?{}&cell={}", selection.query(), encoded(&cell.name))) { (name(&cell.name)) } }
+                    td .n { (cell.ended) } td .n { strong { (um(quantile(&cell.pv_um, 0.5), 3, language)) } }
                     td .box { (drawn(&cell.pv_um, scale)) }
-                    td .n { (share(cell.accepted, cell.ended)) } td .n { (share(cell.at_once, cell.ended)) } td .n .quiet { (interval(cell.at_once, cell.ended)) }
-                    td .n { @if cell.cycles.is_empty() { "–" } @else { (format!("{:.2}", mean(&cell.cycles))) } }
-                    td { (significance(*chance)) }
+                    td .n { (share(cell.accepted, cell.ended)) } td .n { strong { (cell.cycles.mean(language)) } } td { (cell.cycles.bar(language)) }
+                    td .n { (share(cell.at_once, cell.ended)) } td .n .quiet { (interval(cell.at_once, cell.ended)) }
+                    td { (significance(*chance, language)) }
                 }
             }
         }
     }
 }
 
-fn significance(chance: Option<f64>) -> Markup {
+fn significance(chance: Option<f64>, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
     html! {
         @match chance {
-            None => { span .quiet { "too few parts" } }
-            Some(chance) if chance < CHANCE => { strong { "more than chance" } " (" (probability(chance)) ")" }
-            Some(chance) => { "no more than chance (" (probability(chance)) ")" }
+            None => { span .quiet { (say(Text::TooFewParts)) } }
+            Some(chance) if chance < CHANCE => { strong { (say(Text::MoreThanChance)) } " (" (probability(chance, language)) ")" }
+            Some(chance) => { (say(Text::NoMoreThanChance)) " (" (probability(chance, language)) ")" }
         }
     }
 }
 
-fn probability(p: f64) -> String {
-    if p < 0.0001 { "p < 0.0001".to_owned() } else { format!("p = {p:.4}") }
+fn probability(p: f64, language: Language) -> String {
+    if p < 0.0001 {
+        format!("p < {}", decimal(0.0001, 4, language))
+    } else {
+        format!("p = {}", decimal(p, 4, language))
+    }
 }
 
 /// Draws a box plot of `sorted` as SVG. `sorted` contains values in micrometres, in ascending order. The box extends

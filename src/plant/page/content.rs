@@ -2,7 +2,7 @@
 
 use axum::response::Response;
 use maud::Markup;
-use regrind_page::{Session, plant_document};
+use regrind_page::{Reader, plant_document};
 
 use super::page_error::{PageError, unmade, within};
 use super::style::STYLE;
@@ -15,10 +15,10 @@ pub(super) struct PageContent {
 }
 
 /// Returns the HTML page whose content the future `making` computes. If `making` fails, or takes longer than the time
-/// limit (15 s), returns a page with the reason. `session` is the session of the person who has signed in.
-pub(super) async fn page(session: &Session, making: impl Future<Output = Result<PageContent, PageError>>) -> Response {
+/// limit (15 s), returns a page with the reason. `reader` is the reader of the page.
+pub(super) async fn page(reader: &Reader, making: impl Future<Output = Result<PageContent, PageError>>) -> Response {
     match within(making).await {
-        Ok(PageContent { title, again_s, main }) => plant_document(&title, session, again_s, STYLE, main),
-        Err(reason) => unmade(session, &reason),
+        Ok(PageContent { title, again_s, main }) => plant_document(&title, reader, again_s, STYLE, main),
+        Err(reason) => unmade(reader, &reason),
     }
 }

@@ -2,10 +2,10 @@
 
 use std::fmt::Write;
 
-use axum::Extension;
 use axum::extract::{Query, State};
 use axum::response::Response;
-use regrind_page::Session;
+use regrind_language::Language;
+use regrind_page::Reader;
 use regrind_report::{DfqPart, dfq_of_parts};
 
 use super::super::{Row, ToSql};
@@ -14,6 +14,7 @@ use super::page_error::{PageError, unmade, within};
 use super::run::file;
 use super::selection::{NEWEST_FIRST, Selection, SelectionQuery};
 use super::shared::{PlantPage, Shared};
+use super::texts::Text;
 use super::trend::parts;
 
 /// Maximum number of parts in a file.
@@ -65,14 +66,10 @@ const NUMBERS: [&str; 12] = [
     "head",
 ];
 
-pub(super) async fn csv(
-    State(plant): State<Shared>,
-    Extension(session): Extension<Session>,
-    Query(asked): Query<SelectionQuery>,
-) -> Response {
+pub(super) async fn csv(State(plant): State<Shared>, reader: Reader, Query(asked): Query<SelectionQuery>) -> Response {
     match within(csv_of(&plant, &asked)).await {
         Ok(text) => file("parts.csv", "text/csv; charset=utf-8", text),
-        Err(reason) => unmade(&session, &reason),
+        Err(reason) => unmade(&reader, &reason),
     }
 }
 
@@ -114,14 +111,10 @@ fn quoted(text: &str) -> String {
     format!("\"{}{}\"", if formula { "'" } else { "" }, text.replace('"', "\"\""))
 }
 
-pub(super) async fn dfq(
-    State(plant): State<Shared>,
-    Extension(session): Extension<Session>,
-    Query(asked): Query<SelectionQuery>,
-) -> Response {
+pub(super) async fn dfq(State(plant): State<Shared>, reader: Reader, Query(asked): Query<SelectionQuery>) -> Response {
     match within(dfq_of(&plant, &asked)).await {
         Ok(text) => file("parts.dfq", "text/plain; charset=utf-8", text),
-        Err(reason) => unmade(&session, &reason),
+        Err(reason) => unmade(&reader, &reason),
     }
 }
 
@@ -130,9 +123,7 @@ async fn dfq_of(plant: &PlantPage, asked: &SelectionQuery) -> Result<String, Pag
     let selection = Selection::from_query(&link, asked).await?;
     let parts = parts(&link, &selection, MAX_PARTS).await?;
     if parts.is_empty() {
-        return Err(PageError::NotHere(
-            "no part of this selection was measured; change the selection on the page `Trend`".into(),
-        ));
+        return Err(PageError::not_here(Text::NothingMeasured, Vec::new()));
     }
     let figure = |value: &Value| [1e-3 * value.um, 1e-3 * value.u_um.unwrap_or(f64::NAN)];
     let rows: Vec<DfqPart> = parts
@@ -149,7 +140,7 @@ async fn dfq_of(plant: &PlantPage, asked: &SelectionQuery) -> Result<String, Pag
     let mark = if selection.simulated { "SIMULATION. " } else { "" };
     let when = if selection.first { "measured before any correction" } else { "as judged last" };
     let name = if selection.recipe().is_empty() { "several recipes" } else { selection.recipe() };
-    Ok(dfq_of_parts(name, &format!("{mark}{}, {when}", selection.words()), &rows))
+    Ok(dfq_of_parts(name, &format!("{mark}{}, {when}", selection.words(Language::En)), &rows))
 }
 
 #[cfg(test)]

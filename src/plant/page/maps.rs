@@ -2,59 +2,83 @@
 
 use std::path::Path;
 
-use axum::Extension;
 use axum::extract::{RawQuery, State};
 use axum::response::Response;
 use data_encoding::HEXLOWER;
 use maud::{Markup, PreEscaped, html};
 use regrind_formats::{MapNode, parse_error_map};
-use regrind_page::Session;
+use regrind_language::{Language, decimal, filled};
+use regrind_page::Reader;
 use regrind_report::HeatMap;
 use tokio::task::spawn_blocking;
 
 use super::super::copy::content;
 use super::super::link::DatabaseLink;
 use super::content::{PageContent, page};
-use super::page_error::PageError;
+use super::page_error::{Message, PageError};
 use super::selection::mark;
 use super::shared::Shared;
-use super::words::{shown, um};
+use super::texts::Text;
+use super::words::{name, shown, um};
 
 /// Maximum number of maps on the page.
 const MAX_MAPS: usize = 4;
-/// Maximum size of a map, in pixels of the page.
+/// Maximum size of a map, in pixels of the page: of one among others, and of one alone.
 const MAX_SIZE_PX: [f64; 2] = [400.0, 400.0];
-/// Maximum length of a title, in characters. A longer title would be wider than the picture.
-const TITLE: usize = 52;
+const MAX_SIZE_ALONE_PX: [f64; 2] = [440.0, 380.0];
 
 /// Requested map: a run and a cycle; without a cycle, the last cycle of the run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct MapRequest {
-    run: i32,
-    cycle: Option<i32>,
+pub(super) struct MapRequest {
+    pub(super) run: i32,
+    pub(super) cycle: Option<i32>,
 }
 
 /// Map with its run.
-struct Map {
+pub(super) struct Map {
     run: i32,
-    cycle: i32,
+    pub(super) cycle: i32,
     serial: String,
     cell: String,
     recipe: String,
     simulation: bool,
     pv_um: Option<f64>,
     rms_um: Option<f64>,
-    /// Samples (x, y, error), in mm, mm and µm; otherwise a text why there are none.
-    samples: Result<Vec<[f64; 3]>, String>,
+    /// Samples (x, y, error), in mm, mm and µm; otherwise the reason why there are none.
+    samples: Result<Vec<[f64; 3]>, NoMap>,
 }
 
-pub(super) async fn maps(
-    State(plant): State<Shared>,
-    Extension(session): Extension<Session>,
-    RawQuery(query): RawQuery,
-) -> Response {
+/// Reason why there are no samples of a map.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum NoMap {
+    /// The plant has no such map.
+    Missing,
+    /// The file of the map is not on record, or several files have its name.
+    NotOnRecord,
+    /// The file has not arrived at the plant yet.
+    NotArrived,
+    /// The plant's copy of the file has another hash than the one on record.
+    Changed,
+    /// The content of the file cannot be read; the reason in English.
+    Unreadable(String),
+}
+
+impl NoMap {
+    fn to(&self, language: Language) -> String {
+        let text = match self {
+            Self::Missing => Text::MapMissing,
+            Self::NotOnRecord => Text::MapNotOnRecord,
+            Self::NotArrived => Text::MapNotArrived,
+            Self::Changed => Text::MapChanged,
+            Self::Unreadable(reason) => return shown(reason),
+        };
+        text.to(language).to_owned()
+    }
+}
+
+pub(super) async fn maps(State(plant): State<Shared>, reader: Reader, RawQuery(query): RawQuery) -> Response {
     let asked = parse_requests(query.as_deref().unwrap_or_default());
-    page(&session, made(&plant, &asked)).await
+    page(&reader, made(&plant, &asked, reader.language)).await
 }
 
 /// Parses the query of an address, such as `run=17&run=18:2`, into a list of requested maps. Each `run` is the id of a
@@ -70,11 +94,10 @@ fn parse_requests(query: &str) -> Vec<MapRequest> {
     named.filter_map(one).take(MAX_MAPS).collect()
 }
 
-async fn made(plant: &Shared, asked: &[MapRequest]) -> Result<PageContent, PageError> {
+async fn made(plant: &Shared, asked: &[MapRequest], language: Language) -> Result<PageContent, PageError> {
+    let say = |text: Text| text.to(language);
     if asked.is_empty() {
-        return Err(PageError::Nonsense(
-            "name the runs, as in /maps?run=17&run=18, or tick them in the list of parts".into(),
-        ));
+        return Err(PageError::Nonsense(Message::Text(Text::NameTheRuns, Vec::new())));
     }
     let mut maps = Vec::new();
     {
@@ -83,17 +106,18 @@ async fn made(plant: &Shared, asked: &[MapRequest]) -> Result<PageContent, PageE
             maps.push(read(plant, &link, *one).await?);
         }
     }
-    let drawn = spawn_blocking(move || side_by_side(&maps)).await;
+    let drawn = spawn_blocking(move || side_by_side(&maps, language)).await;
     let main = html! {
         main .list .plant {
-            h1 { "Maps" }
+            h1 { (say(Text::Maps)) }
             (drawn.unwrap_or_default())
         }
     };
-    Ok(PageContent { title: "Maps".into(), again_s: None, main })
+    Ok(PageContent { title: say(Text::Maps).into(), again_s: None, main })
 }
 
-async fn read(plant: &Shared, link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageError> {
+/// Reads a map with its run from the plant.
+pub(super) async fn read(plant: &Shared, link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageError> {
     let text = "SELECT cycle, serial, cell, recipe, simulation, pv_um, rms_um, map FROM cycle_figure
         WHERE run_id = $1 AND map IS NOT NULL AND ($2::integer IS NULL OR cycle = $2) ORDER BY cycle DESC LIMIT 1";
     let rows = link.query(text, &[&asked.run, &asked.cycle]).await?;
@@ -122,8 +146,7 @@ async fn read(plant: &Shared, link: &DatabaseLink, asked: MapRequest) -> Result<
 async fn without(link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageError> {
     let text = "SELECT serial, cell, recipe, simulation, pv_um, rms_um FROM part_run WHERE id = $1";
     let rows = link.query(text, &[&asked.run]).await?;
-    let missing = || PageError::NotHere(format!("the plant has no run {} that made a part", asked.run));
-    let row = rows.first().ok_or_else(missing)?;
+    let row = rows.first().ok_or_else(|| PageError::no_run(asked.run))?;
     let words = |k: usize| row.get::<_, Option<String>>(k).unwrap_or_default();
     Ok(Map {
         run: asked.run,
@@ -134,29 +157,28 @@ async fn without(link: &DatabaseLink, asked: MapRequest) -> Result<Map, PageErro
         simulation: row.get::<_, Option<bool>>(3) == Some(true),
         pv_um: row.get(4),
         rms_um: row.get(5),
-        samples: Err("the plant has no such map".into()),
+        samples: Err(NoMap::Missing),
     })
 }
 
 /// Reads the error map in the file `name` of the run with the id `run`. Each sample is `[x, y, error]`, with x and y in
 /// mm and the error in µm.
 ///
-/// The inner `Err` is a text for people that says why the map cannot be shown, for example because its file has not
-/// arrived at the plant. The outer `Err` means that the plant could not answer the query.
+/// The inner `Err` is the reason why the map cannot be shown, for example because its file has not arrived at the plant. The outer `Err` means that the plant could not answer the query.
 async fn samples(
     plant: &Shared,
     link: &DatabaseLink,
     run: i32,
     name: &str,
-) -> Result<Result<Vec<[f64; 3]>, String>, PageError> {
+) -> Result<Result<Vec<[f64; 3]>, NoMap>, PageError> {
     let rows = link.query("SELECT sha256 FROM run_artefact WHERE run = $1 AND name = $2", &[&run, &name]).await?;
-    let [row] = &rows[..] else { return Ok(Err("its file is not on record, or several files have its name".into())) };
+    let [row] = &rows[..] else { return Ok(Err(NoMap::NotOnRecord)) };
     let sha256: Vec<u8> = row.get(0);
     let Some(content) = content(link, plant.artefacts.as_ref(), &sha256).await? else {
-        return Ok(Err("its file has not arrived yet".into()));
+        return Ok(Err(NoMap::NotArrived));
     };
     if regrind_journal::sha256_hex(&content) != HEXLOWER.encode(&sha256) {
-        return Ok(Err("the plant's copy of its file was changed".into()));
+        return Ok(Err(NoMap::Changed));
     }
     let name = name.to_owned();
     let parsed = spawn_blocking(move || {
@@ -164,41 +186,47 @@ async fn samples(
         let nodes = parse_error_map(Path::new(&name), &text).map_err(|error| error.to_string())?;
         Ok(nodes.iter().map(MapNode::error).map(|[x, y, error_mm]| [x, y, 1e3 * error_mm]).collect())
     });
-    Ok(parsed.await.unwrap_or_else(|_| Err("it could not be read".into())))
+    let parsed: Result<_, String> = parsed.await.unwrap_or_else(|_| Err("it could not be read".into()));
+    Ok(parsed.map_err(NoMap::Unreadable))
 }
 
 /// Draws error maps next to each other with one common colour scale. The scale is symmetric about zero, and its limit
 /// is the largest absolute error of all maps in µm. A map without samples is replaced by the reason.
-fn side_by_side(maps: &[Map]) -> Markup {
+fn side_by_side(maps: &[Map], language: Language) -> Markup {
     let all = maps.iter().filter_map(|map| map.samples.as_ref().ok()).flatten();
     let limit = all.fold(0.0_f64, |most, sample| most.max(sample[2].abs()));
     html! {
         div .maps {
             @for map in maps {
                 figure data-run=(map.run) {
-                    (drawn(map, limit))
                     figcaption {
-                        a href=(format!("/runs/{}", map.run)) { (shown(&map.serial)) } @if map.cycle > 0 { ", cycle " (map.cycle) } ", " (shown(&map.cell)) ", " (shown(&map.recipe)) " " (mark(map.simulation))
-                        br; "judged: PV " (um(map.pv_um, 2)) " µm, RMS " (um(map.rms_um, 3)) " µm"
+                        a href=(format!("/runs/{}", map.run)) { (name(&map.serial)) } @if map.cycle > 0 { ", " (Text::Cycle.to(language)) " " (map.cycle) } ", " (name(&map.cell)) ", " (name(&map.recipe)) " " (mark(map.simulation))
+                        br; (Text::JudgedAs.to(language)) " PV " (um(map.pv_um, 2, language)) " µm, RMS " (um(map.rms_um, 3, language)) " µm"
                     }
+                    (drawn(map, MAX_SIZE_PX, limit, language))
                 }
             }
         }
         p .quiet {
-            "One scale for all: " (format!("± {limit:.2}")) " µm. Red stands proud of the nominal surface, blue lies below it, near white is zero. The maps are filtered: PV and RMS of a map differ from the \
-             figures that are judged. Each file has the hash on record."
+            (filled(Text::OneScale.to(language), &[("limit", &decimal(limit, 2, language))])) " " (Text::SignOfMaps.to(language)) " " (Text::HashOfMaps.to(language))
         }
     }
 }
 
-fn drawn(map: &Map, limit_um: f64) -> Markup {
-    let title =
-        format!("{}, cycle {}{}", shown(&map.serial), map.cycle, if map.simulation { " (SIMULATION)" } else { "" });
-    let title: String = title.chars().take(TITLE).collect();
-    let svg = map.samples.as_ref().map_err(Clone::clone).and_then(|samples| {
-        let heat = HeatMap::new(&title, "deviation", "\u{b5}m", samples)
-            .and_then(|heat| heat.of_nodes().with_max_size(MAX_SIZE_PX).with_limit(limit_um));
-        heat.and_then(|heat| heat.to_svg()).map_err(|error| error.to_string())
+/// Draws the map of a run alone, with the scale of its largest error, and says what the colours mean.
+pub(super) fn map_of_run(map: &Map, language: Language) -> Markup {
+    let limit = map.samples.iter().flatten().fold(0.0_f64, |most, sample| most.max(sample[2].abs()));
+    html! {
+        figure .wide data-run=(map.run) data-cycle=(map.cycle) { (drawn(map, MAX_SIZE_ALONE_PX, limit, language)) }
+        p .quiet { (Text::SignOfMaps.to(language)) }
+    }
+}
+
+fn drawn(map: &Map, max_size: [f64; 2], limit_um: f64, language: Language) -> Markup {
+    let svg = map.samples.as_ref().map_err(|reason| reason.to(language)).and_then(|samples| {
+        let heat = HeatMap::new("", "", "\u{b5}m", samples)
+            .and_then(|heat| heat.of_nodes().with_max_size(max_size).with_limit(limit_um));
+        heat.and_then(|heat| heat.to_plain_svg(language)).map_err(|error| shown(&error.to_string()))
     });
     match svg {
         // The content policy of the page forbids inline styles, so the style becomes an attribute with the same effect.
@@ -206,7 +234,7 @@ fn drawn(map: &Map, limit_um: f64) -> Markup {
             svg.replace(" style=\"image-rendering:pixelated\"", " image-rendering=\"pixelated\"")
                 .replace(" style=\"image-rendering:auto\"", ""),
         ),
-        Err(reason) => html! { p .no { "No map: " (shown(&reason)) } },
+        Err(reason) => html! { p .no { (Text::NoMap.to(language)) " " (reason) } },
     }
 }
 
@@ -236,10 +264,10 @@ mod tests {
             samples: if samples {
                 Ok((0..25).map(|k| [f64::from(k % 5), f64::from(k / 5), um * f64::from(k) / 24.0]).collect())
             } else {
-                Err("<i>gone".into())
+                Err(NoMap::Unreadable("<i>gone".into()))
             },
         };
-        let html = side_by_side(&[map(1.0, true), map(-4.0, true), map(0.0, false)]).into_string();
+        let html = side_by_side(&[map(1.0, true), map(-4.0, true), map(0.0, false)], Language::En).into_string();
         assert!(html.contains("± 4.00 µm") && html.contains("&lt;i&gt;gone") && !html.contains("<b>"), "{html}");
         assert_eq!(html.matches("<svg").count(), 2);
         assert!(!html.contains("style="), "the page takes none");

@@ -7,16 +7,24 @@
 //! ```
 //!
 //! All figures of the page are in the views, which Grafana reads too. Texts from a cell are shown as text, never as
-//! HTML.
+//! HTML. The texts of the page are in the files of the languages (regrind-language).
 
 mod bars;
+mod board;
+mod capability;
 mod cells;
 mod compare;
 mod content;
 mod control_chart;
+mod convergence;
+mod cycle_counts;
+#[cfg(test)]
+mod draws;
 mod export;
 mod home;
 mod maps;
+mod natural;
+mod nelson;
 mod page_error;
 mod parts;
 mod pool;
@@ -27,6 +35,7 @@ mod run;
 mod selection;
 mod shared;
 mod style;
+mod texts;
 mod trend;
 mod words;
 

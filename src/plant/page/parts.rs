@@ -1,10 +1,10 @@
 //! `/parts`: parts whose serial numbers begin with a text; without a text, the newest parts.
 
-use axum::Extension;
 use axum::extract::{Query, State};
 use axum::response::Response;
 use maud::{Markup, html};
-use regrind_page::Session;
+use regrind_language::Language;
+use regrind_page::Reader;
 use serde::Deserialize;
 
 use super::super::error::PlantError;
@@ -13,7 +13,8 @@ use super::super::{Row, ToSql};
 use super::content::{PageContent, page};
 use super::page_error::PageError;
 use super::shared::Shared;
-use super::words::{encoded, shown, um};
+use super::texts::{Text, result_word};
+use super::words::{encoded, name, um, when};
 
 /// Maximum number of parts on a page.
 const MAX_ROWS: usize = 100;
@@ -29,36 +30,33 @@ pub(super) struct PartsQuery {
     after: Option<i32>,
 }
 
-pub(super) async fn parts(
-    State(plant): State<Shared>,
-    Extension(session): Extension<Session>,
-    Query(asked): Query<PartsQuery>,
-) -> Response {
-    page(&session, made(&plant, &asked)).await
+pub(super) async fn parts(State(plant): State<Shared>, reader: Reader, Query(asked): Query<PartsQuery>) -> Response {
+    page(&reader, made(&plant, &asked, reader.language)).await
 }
 
-async fn made(plant: &Shared, asked: &PartsQuery) -> Result<PageContent, PageError> {
+async fn made(plant: &Shared, asked: &PartsQuery, language: Language) -> Result<PageContent, PageError> {
+    let say = |text: Text| text.to(language);
     let serial = asked.serial.trim().replace('\0', "");
     let link = plant.lease().await?;
     let rows = read(&link, &serial, asked.after).await?;
     let next = (rows.len() > MAX_ROWS).then(|| rows[MAX_ROWS - 1].get::<_, i32>(0));
     let main = html! {
         main .list .plant {
-            h1 { "Parts" }
+            h1 { (say(Text::Parts)) }
             form .filter method="get" action="/parts" {
-                label { "Serial number begins with " input name="serial" value=(serial) autofocus; } button { "Search" }
+                label { (say(Text::SerialBegins)) " " input name="serial" value=(serial) autofocus; } button { (say(Text::Search)) }
             }
-            @if rows.is_empty() { p { "No serial number begins with this text. Capital and small letters are different." } } @else {
+            @if rows.is_empty() { p { (say(Text::NoSerialBegins)) } } @else {
                 form method="get" action="/maps" {
-                    div .wide { (table(&rows[..rows.len().min(MAX_ROWS)])) }
-                    p { "Tick two to four: " button { "Maps side by side" } }
+                    div .wide { (table(&rows[..rows.len().min(MAX_ROWS)], language)) }
+                    p { (say(Text::TickTwoToFour)) " " button { (say(Text::MapsSideBySide)) } }
                 }
             }
-            @if let Some(next) = next { p { a href=(format!("/parts?serial={}&after={next}", encoded(&serial))) { "More" } } }
-            p .quiet { @if serial.is_empty() { "The newest first." } @else { "By serial number, of each the newest first." } }
+            @if let Some(next) = next { p { a href=(format!("/parts?serial={}&after={next}", encoded(&serial))) { (say(Text::More)) } } }
+            p .quiet { (say(if serial.is_empty() { Text::NewestFirst } else { Text::BySerialNewestFirst })) }
         }
     };
-    Ok(PageContent { title: "Parts".into(), again_s: None, main })
+    Ok(PageContent { title: say(Text::Parts).into(), again_s: None, main })
 }
 
 const COLUMNS: &str = "id, serial, part_name, recipe, cell, run, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), cycles, pv_um, rms_um, result, simulation";
@@ -100,11 +98,12 @@ async fn read(link: &DatabaseLink, serial: &str, after: Option<i32>) -> Result<V
     link.query(&text, &values).await
 }
 
-fn table(rows: &[Row]) -> Markup {
+fn table(rows: &[Row], language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
     html! {
         table .parts {
             tr {
-                th {} th { "Serial number" } th { "Part" } th { "Recipe" } th { "Cell" } th { "Began, UTC" } th .n { "Cycles" } th .n { "PV, µm" } th .n { "RMS, µm" } th { "Result" }
+                th {} th { (say(Text::SerialNumber)) } th { (say(Text::Part)) } th { (say(Text::Recipe)) } th { (say(Text::Cell)) } th { (say(Text::Began)) } th .n { (say(Text::Cycles)) } th .n { "PV, µm" } th .n { "RMS, µm" } th { (say(Text::Result)) }
             }
             @for row in rows {
                 @let id = row.get::<_, i32>(0);
@@ -112,13 +111,13 @@ fn table(rows: &[Row]) -> Markup {
                 @let result = row.get::<_, Option<&str>>(10).unwrap_or("open");
                 tr {
                     td { input type="checkbox" name="run" value=(id) aria-label=(run); }
-                    td { a href=(format!("/runs/{id}")) { @if serial.is_empty() { (shown(run)) } @else { (shown(serial)) } } }
-                    td { (shown(part)) } td { (shown(recipe)) } td { (shown(cell)) }
-                    td { (row.get::<_, Option<&str>>(6).unwrap_or_default()) }
+                    td { a href=(format!("/runs/{id}")) { (name(if serial.is_empty() { run } else { serial })) } }
+                    td { (name(part)) } td { (name(recipe)) } td { (name(cell)) }
+                    td { (when(row.get::<_, Option<&str>>(6).unwrap_or_default())) }
                     td .n { (row.get::<_, Option<i32>>(7).map_or("–".to_owned(), |cycles| cycles.to_string())) }
-                    td .n { (um(row.get(8), 2)) } td .n { (um(row.get(9), 3)) }
+                    td .n { (um(row.get(8), 2, language)) } td .n { (um(row.get(9), 3, language)) }
                     td class=(if result == "accepted" { "good" } else { "" }) {
-                        (shown(result)) @if row.get::<_, Option<bool>>(11) == Some(true) { " " span .quiet { "(simulated)" } }
+                        (result_word(result, language)) @if row.get::<_, Option<bool>>(11) == Some(true) { " " span .quiet { "(" (say(Text::Simulated)) ")" } }
                     }
                 }
             }

@@ -4,25 +4,29 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::Extension;
 use axum::extract::{Path, Query, State};
 use axum::http::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
 use axum::http::{HeaderName, StatusCode};
 use axum::response::{IntoResponse, Redirect, Response};
 use maud::{Markup, html};
-use regrind_page::Session;
+use regrind_language::{Language, filled};
+use regrind_page::{Reader, gauge};
 use serde::Deserialize;
+use tokio::task::spawn_blocking;
 
 use super::super::Row;
 use super::super::error::PlantError;
 use super::super::link::DatabaseLink;
 use super::content::{PageContent, page};
-use super::page_error::{PageError, unmade, within};
+use super::convergence::convergence;
+use super::maps::{self, MapRequest, map_of_run};
+use super::page_error::{Message, PageError, unmade, within};
 use super::proof::proven;
 use super::proofs::Proof;
 use super::selection::mark;
 use super::shared::{PlantPage, Shared};
-use super::words::{encoded, shown, um};
+use super::texts::{Text, result_word};
+use super::words::{clamped, encoded, shown, um, when};
 
 /// Time that the page waits for the proof before it is shown without it, and seconds until the browser then retries.
 const WAITS: Duration = Duration::from_secs(3);
@@ -44,8 +48,7 @@ impl Run {
     async fn read(link: &DatabaseLink, id: i32) -> Result<Self, PageError> {
         let text = format!("SELECT {} FROM part_run WHERE id = $1", Self::COLUMNS);
         let mut rows = link.query(&text, &[&id]).await?;
-        let row =
-            rows.pop().ok_or_else(|| PageError::NotHere(format!("the plant has no run {id} that made a part")))?;
+        let row = rows.pop().ok_or_else(|| PageError::no_run(id))?;
         Ok(Self { id: row.get(0), cell: row.get(1), name: row.get(2), head: row.get(3), row })
     }
 
@@ -62,7 +65,7 @@ impl Run {
 /// Parses the id of a run from the text `id` in an address. Returns an error for the reader of the page if `id` is not
 /// an integer.
 fn number(id: &str) -> Result<i32, PageError> {
-    id.parse().map_err(|_| PageError::NotHere("give the number of a run, as in /runs/17".into()))
+    id.parse().map_err(|_| PageError::not_here(Text::GiveNumber, Vec::new()))
 }
 
 /// Query of `/run`: the name of a cell, and the name of one of its runs.
@@ -74,36 +77,42 @@ pub(super) struct Named {
 
 pub(super) async fn by_name(
     State(plant): State<Shared>,
-    Extension(session): Extension<Session>,
+    reader: Reader,
     Query(Named { cell, name }): Query<Named>,
 ) -> Response {
     let found = async {
         let link = plant.lease().await?;
         let [cell, name] = [cell, name].map(|text| text.replace('\0', ""));
         let rows = link.query("SELECT id FROM part_run WHERE cell = $1 AND run = $2", &[&cell, &name]).await?;
-        let missing = || PageError::NotHere(format!("the plant has no record of the run {name} of {cell} yet"));
+        let missing = || PageError::not_here(Text::NoRecordYet, vec![("run", name.clone()), ("cell", cell.clone())]);
         rows.first().map(|row| row.get::<_, i32>(0)).ok_or_else(missing)
     };
     match within(found).await {
         Ok(id) => Redirect::to(&format!("/runs/{id}")).into_response(),
-        Err(reason) => unmade(&session, &reason),
+        Err(reason) => unmade(&reader, &reason),
     }
 }
 
-pub(super) async fn run(
-    State(plant): State<Shared>,
-    Extension(session): Extension<Session>,
-    Path(id): Path<String>,
-) -> Response {
-    page(&session, async { made(&plant, number(&id)?).await }).await
+pub(super) async fn run(State(plant): State<Shared>, reader: Reader, Path(id): Path<String>) -> Response {
+    page(&reader, async { made(&plant, number(&id)?, reader.language).await }).await
 }
 
-async fn made(plant: &Shared, id: i32) -> Result<PageContent, PageError> {
-    let (run, cycles, maps) = {
+async fn made(plant: &Shared, id: i32, language: Language) -> Result<PageContent, PageError> {
+    let say = |text: Text| text.to(language);
+    let (run, cycles, maps, map) = {
         let link = plant.lease().await?;
         let run = Run::read(&link, id).await?;
-        (run, cycles(&link, id).await?, maps_of(&link, id).await?)
+        let (cycles, maps) = (cycles(&link, id).await?, maps_of(&link, id).await?);
+        // A run without a map has no picture; the reason of a map that cannot be drawn is in its place.
+        let map = if maps.is_empty() {
+            None
+        } else {
+            Some(maps::read(plant, &link, MapRequest { run: id, cycle: None }).await?)
+        };
+        (run, cycles, maps, map)
     };
+    let shown_cycle = map.as_ref().map(|map| map.cycle);
+    let drawn = spawn_blocking(move || map.map(|map| map_of_run(&map, language))).await.unwrap_or_default();
     // The proof continues in its own task after this page is shown without it.
     let (shared, cell, name, head) = (Arc::clone(plant), run.cell.clone(), run.name.clone(), run.head.clone());
     let proving = tokio::spawn(async move { proven(&shared, id, &cell, &name, &head).await });
@@ -113,81 +122,110 @@ async fn made(plant: &Shared, id: i32) -> Result<PageContent, PageError> {
     };
     let title = if run.text(4).is_empty() { run.name.clone() } else { run.text(4).to_owned() };
     let main = html! {
-        main .list .plant {
-            h1 { (shown(&title)) " " (mark(run.is_simulated())) }
-            (about(&run))
-            h2 { "The copy of the plant" }
-            (proof_text(proof.as_deref()))
-            @if let Some(proof) = proof.as_ref().filter(|proof| proof.outcome.is_ok()) { (made_of_it(&run, proof)) }
-            h2 { "Cycles" }
-            (cycles)
-            @if let Some(first) = maps.first() {
-                p {
-                    "Maps: " a href=(format!("/maps?run={id}")) { "the last" }
-                    @if maps.len() > 1 { " · " a href=(format!("/maps?run={id}:{first}&run={id}:{}", maps[maps.len() - 1])) { "the first and the last on one scale" } }
+        main .list .plant .of-run {
+            div .head { h1 { (shown(&title)) " " (mark(run.is_simulated())) } (verdict(&run, language)) }
+            div .run-grid {
+                section .card .map {
+                    h2 { (say(Text::ErrorMap)) @if let Some(cycle) = shown_cycle { ", " (say(Text::Cycle)) " " (cycle) } " " (mark(run.is_simulated())) }
+                    @match drawn { Some(drawn) => { (drawn) } None => { p .quiet { (say(Text::NoMapReported)) } } }
+                    @if let [first, .., last] = maps[..] {
+                        p { a href=(format!("/maps?run={id}:{first}&run={id}:{last}")) { (say(Text::FirstAndLastMap)) } }
+                    }
                 }
+                div .column {
+                    section .card { h2 { (say(Text::LastJudged)) } (figures(&cycles, language)) }
+                    section .card #convergence { h2 { (say(Text::Convergence)) } (convergence(&cycles, limits(&cycles), language)) }
+                }
+            }
+            section .card { h2 { (say(Text::Cycles)) } (table(&cycles, language)) }
+            div .pair {
+                section .card { h2 { (say(Text::CopyOfPlant)) } (proof_text(proof.as_deref(), language)) @if let Some(proof) = proof.as_ref().filter(|proof| proof.outcome.is_ok()) { (made_of_it(&run, proof, language)) } }
+                section .card { h2 { (say(Text::Run)) } (about(&run, language)) }
             }
         }
     };
     Ok(PageContent { title: shown(&title), again_s: proof.is_none().then_some(AGAIN_S), main })
 }
 
-fn about(run: &Run) -> Markup {
+/// Returns the result of a run as the page of a cell shows it, and its reason.
+fn verdict(run: &Run, language: Language) -> Markup {
     let result = run.text(12);
     // The verdict in the record begins with the word of the result.
     let verdict = run.text(13);
     let reason = verdict.split_once(": ").filter(|(word, _)| word.chars().all(|c| !c.is_lowercase()));
-    let verdict = reason.map_or(verdict, |(_, reason)| reason);
-    let row = |what: &str, text: &str| html! { @if !text.is_empty() { dt { (what) } dd { (shown(text)) } } };
+    let reason = reason.map_or(verdict, |(_, reason)| reason);
+    let class = match result {
+        "accepted" => "good",
+        "not accepted" => "rejected",
+        "aborted" => "bad",
+        _ => "",
+    };
     html! {
-        p .verdict.good[result == "accepted"] { strong { (shown(if result.is_empty() { "open" } else { result })) } @if !verdict.is_empty() { ": " (shown(verdict)) } }
+        div .banner .(class) { div .state { div { strong { (result_word(if result.is_empty() { "open" } else { result }, language)) } } } }
+        @if !reason.is_empty() { div .reason-of-verdict { (clamped(reason)) } }
+    }
+}
+
+fn about(run: &Run, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    let row = |what: Text, text: &str| html! { @if !text.is_empty() { dt { (say(what)) } dd { (shown(text)) } } };
+    let time = |what: Text, utc: &str| html! { @if !utc.is_empty() { dt { (say(what)) } dd { (when(utc)) } } };
+    html! {
         dl .about {
-            (row("Part", run.text(5)))
-            dt { "Cell" } dd { (shown(&run.cell)) }
-            dt { "Recipe" } dd { a href=(format!("/trend?recipe={}", encoded(run.text(6)))) { (shown(run.text(6))) } " " span .id { (shown(run.text(7))) } }
-            (row("Operator", run.text(8)))
-            (row("Began, UTC", run.text(10))) (row("Ended, UTC", run.text(11)))
-            (row("Grinder", run.text(14))) (row("CMM", run.text(15))) (row("Wheel", run.text(16))) (row("Probe", run.text(17)))
-            dt { "Alarms" } dd { (run.row.get::<_, Option<i32>>(18).map_or("not told".to_owned(), |n| n.to_string())) }
-            dt { "Run" } dd .id { (shown(&run.name)) }
+            (row(Text::Part, run.text(5)))
+            dt { (say(Text::Cell)) } dd { (shown(&run.cell)) }
+            dt { (say(Text::Recipe)) } dd { a href=(format!("/trend?recipe={}", encoded(run.text(6)))) { (shown(run.text(6))) } " " span .id { (shown(run.text(7))) } }
+            (row(Text::Operator, run.text(8)))
+            (time(Text::Began, run.text(10))) (time(Text::Ended, run.text(11)))
+            (row(Text::Grinder, run.text(14))) (row(Text::Cmm, run.text(15))) (row(Text::Wheel, run.text(16))) (row(Text::Probe, run.text(17)))
+            dt { (say(Text::Alarms)) } dd { (run.row.get::<_, Option<i32>>(18).map_or(say(Text::NotTold).to_owned(), |n| n.to_string())) }
+            dt { (say(Text::Run)) } dd .id { (shown(&run.name)) }
         }
-        p .quiet { "As reported by the cell; the report shows the content of the record." }
+        p .quiet { (say(Text::AsReported)) }
     }
 }
 
 /// Describes the result of the verification of a run in words, as HTML. The verification checks the plant's copy of the
 /// run. If `proof` is `None`, says that the verification has not ended yet.
-fn proof_text(proof: Option<&Proof>) -> Markup {
+fn proof_text(proof: Option<&Proof>, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
     let Some(proof) = proof else {
-        return html! { p role="status" { "The copy is being fetched and verified; this page then shows the result by itself." } };
+        return html! { p role="status" { (say(Text::CopyIsVerified)) } };
     };
+    let found = match &proof.outcome {
+        Ok(found) => found,
+        Err(reason) => {
+            return html! {
+                p .no role="alert" { strong { (say(Text::NotProven)) } " " (when(&proof.at)) ": " (shown(reason)) }
+                p { (say(Text::KeepAndCompare)) }
+            };
+        }
+    };
+    let is_signed = proof.is_signed_to_end();
+    let signatures = match (found.signed, proof.keys, is_signed) {
+        (0, ..) => Text::CopyNotSigned,
+        (_, 0, _) => Text::SignedByUnknownKey,
+        (.., true) => Text::SignedToEnd,
+        _ => Text::SignedInPart,
+    };
+    let counts: [(&str, &dyn std::fmt::Display); 3] =
+        [("records", &found.records), ("files", &found.artefacts), ("signed", &found.signed)];
     html! {
-        @match &proof.outcome {
-            Ok(found) => {
-                p .proven[proof.is_signed_to_end()] {
-                    strong { @if proof.is_signed_to_end() { "Proven" } @else { "Unbroken, but not proven" } }
-                    " at " (proof.at) " UTC: " (found.records) " records in an unbroken chain and " (found.artefacts) " unchanged files"
-                    @if found.signed == 0 { "; not signed, so whoever can write into the plant can have made them" }
-                    @else if proof.keys == 0 { "; signatures up to record " (found.signed) ", with a key that is not enrolled at the plant" }
-                    @else if proof.is_signed_to_end() { "; signed to the end, with a key that is enrolled for the cell" }
-                    @else { "; signatures up to record " (found.signed) " only, with a key that is enrolled for the cell: nothing proves the records after it" }
-                    @if found.closed { "." } @else { ". The run has no recorded end: it is still active, or its record was cut before the end arrived." }
-                }
-                @if !proof.differences.is_empty() {
-                    p .no role="alert" { strong { "The report of the cell differs from the record" } ": " (shown(&proof.differences.join("; "))) }
-                }
-            }
-            Err(reason) => {
-                p .no role="alert" { strong { "NOT PROVEN" } " at " (proof.at) " UTC: " (shown(reason)) }
-                p { "Keep the plant and the cell as they are, and compare: regrind audit verify --plant" }
-            }
+        p .proven[is_signed] {
+            strong { (say(if is_signed { Text::Proven } else { Text::Unbroken })) } " " (when(&proof.at)) ": "
+            (filled(say(Text::ChainAndFiles), &counts)) " " (filled(say(signatures), &counts)) " "
+            @if !found.closed { (say(Text::NoRecordedEnd)) }
+        }
+        @if !proof.differences.is_empty() {
+            p .no role="alert" { strong { (say(Text::ReportDiffers)) } " " (shown(&proof.differences.join("; "))) }
         }
     }
 }
 
-fn made_of_it(run: &Run, proof: &Proof) -> Markup {
+fn made_of_it(run: &Run, proof: &Proof, language: Language) -> Markup {
     let id = run.id;
-    let one = |path: &str, name: &str, made: &Result<String, String>| {
+    let one = |path: &str, text: Text, made: &Result<String, String>| {
+        let name = text.to(language);
         html! {
             @match made {
                 Ok(_) => { li { a href=(format!("/runs/{id}/{path}")) { (name) } } }
@@ -196,36 +234,63 @@ fn made_of_it(run: &Run, proof: &Proof) -> Markup {
         }
     };
     html! {
-        ul .made { (one("report", "Report", &proof.report)) (one("qif", "Results as QIF 3.0", &proof.qif)) (one("dfq", "Results as DFQ (Q-DAS)", &proof.dfq)) }
+        ul .made { (one("report", Text::Report, &proof.report)) (one("qif", Text::ResultsAsQif, &proof.qif)) (one("dfq", Text::ResultsAsDfq, &proof.dfq)) }
     }
 }
 
-async fn cycles(link: &DatabaseLink, id: i32) -> Result<Markup, PlantError> {
+/// Reads the cycles of a run in order: the cycle, PV, its expanded uncertainty, RMS, its expanded uncertainty, the
+/// verdict, its reason, the expected PV, and the limits of PV and RMS.
+async fn cycles(link: &DatabaseLink, id: i32) -> Result<Vec<Row>, PlantError> {
     let text = "SELECT cycle, pv_um, pv_u_um, rms_um, rms_u_um, verdict, reason, expected_pv_um, pv_limit_um, rms_limit_um FROM cycle_figure
         WHERE run_id = $1 ORDER BY cycle LIMIT 1000";
-    let rows = link.query(text, &[&id]).await?;
-    let limits = rows.last().map(|row| [row.get::<_, Option<f64>>(8), row.get(9)]);
-    Ok(html! {
-        @if rows.is_empty() { p .quiet { "No cycle is reported yet." } } @else {
+    link.query(text, &[&id]).await
+}
+
+/// Returns the limits of PV and RMS in µm from the cycles of a run.
+fn limits(cycles: &[Row]) -> [Option<f64>; 2] {
+    cycles.last().map_or([None; 2], |row| [8, 9].map(|k| row.get::<_, Option<f64>>(k).filter(|um| um.is_finite())))
+}
+
+/// Shows PV and RMS of the last measured cycle, each with its uncertainty, its limit, and a bar of all three.
+fn figures(cycles: &[Row], language: Language) -> Markup {
+    let number = |row: &Row, k: usize| row.get::<_, Option<f64>>(k).filter(|um| um.is_finite());
+    let last = cycles.iter().rev().find(|row| number(row, 1).is_some());
+    html! {
+        @match last {
+            None => { p .quiet { (Text::NoCycleReported.to(language)) } }
+            Some(row) => {
+                @for (name, k, digits, limit) in [("PV", 1, 2, limits(cycles)[0]), ("RMS", 3, 3, limits(cycles)[1])] {
+                    @if let Some(value) = number(row, k) { (gauge(name, [value, number(row, k + 1).unwrap_or(f64::NAN)], limit, digits, language)) }
+                }
+            }
+        }
+    }
+}
+
+fn table(cycles: &[Row], language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    let [pv, rms] = limits(cycles);
+    html! {
+        @if cycles.is_empty() { p .quiet { (say(Text::NoCycleReported)) } } @else {
             div .wide { table {
-                tr { th .n { "Cycle" } th .n { "PV, µm" } th .n { "± U" } th .n { "RMS, µm" } th .n { "± U" } th .n { "expected PV" } th { "Judged" } }
-                @for row in &rows {
+                tr { th .n { (say(Text::Cycle)) } th .n { "PV, µm" } th .n { "± U" } th .n { "RMS, µm" } th .n { "± U" } th .n { (say(Text::ExpectedPv)) } th { (say(Text::Judged)) } }
+                @for row in cycles {
                     @let [verdict, reason] = [5, 6].map(|k| row.get::<_, Option<&str>>(k).unwrap_or_default());
                     tr {
                         td .n { (row.get::<_, i32>(0)) }
-                        td .n { strong { (um(row.get(1), 2)) } } td .n { (um(row.get(2), 2)) }
-                        td .n { strong { (um(row.get(3), 3)) } } td .n { (um(row.get(4), 3)) }
-                        td .n { (um(row.get(7), 2)) }
-                        td { @if verdict.is_empty() { (shown(reason)) } @else { strong { (shown(verdict)) } @if !reason.is_empty() { ": " (shown(reason)) } } }
+                        td .n { strong { (um(row.get(1), 2, language)) } } td .n { (um(row.get(2), 2, language)) }
+                        td .n { strong { (um(row.get(3), 3, language)) } } td .n { (um(row.get(4), 3, language)) }
+                        td .n { (um(row.get(7), 2, language)) }
+                        td { @if !verdict.is_empty() { strong { (shown(verdict)) } @if !reason.is_empty() { ": " } } (clamped(reason)) }
                     }
                 }
-                @if let Some([pv, rms]) = limits {
-                    tr .limit { td .n { "allowed" } td .n { (um(pv, 2)) } td {} td .n { (um(rms, 3)) } td {} td {} td {} }
+                @if pv.is_some() || rms.is_some() {
+                    tr .limit { td .n { (say(Text::Allowed)) } td .n { (um(pv, 2, language)) } td {} td .n { (um(rms, 3, language)) } td {} td {} td {} }
                 }
             } }
-            p .quiet { "U: expanded uncertainty, k = 2. Expected: PV that was predicted to remain after the correction from this cycle." }
+            p .quiet { (say(Text::UncertaintyIs)) }
         }
-    })
+    }
 }
 
 /// Returns the numbers of the cycles that have an error map, in ascending order. `id` is the id of the run in the
@@ -250,11 +315,7 @@ async fn proof_of(plant: &PlantPage, id: &str) -> Result<(Run, Arc<Proof>), Page
     Ok((run, proof))
 }
 
-pub(super) async fn report(
-    State(plant): State<Shared>,
-    Extension(session): Extension<Session>,
-    Path(id): Path<String>,
-) -> Response {
+pub(super) async fn report(State(plant): State<Shared>, reader: Reader, Path(id): Path<String>) -> Response {
     match proof_of(&plant, &id).await {
         Ok((_, proof)) => match &proof.report {
             Ok(html) => {
@@ -266,31 +327,23 @@ pub(super) async fn report(
                 ];
                 (headers, html.clone()).into_response()
             }
-            Err(reason) => not_made(&session, reason),
+            Err(reason) => not_made(&reader, reason),
         },
-        Err(reason) => unmade(&session, &reason),
+        Err(reason) => unmade(&reader, &reason),
     }
 }
 
-pub(super) async fn qif(
-    State(plant): State<Shared>,
-    Extension(session): Extension<Session>,
-    Path(id): Path<String>,
-) -> Response {
-    results(&plant, &session, &id, "qif", "application/xml", |proof| &proof.qif).await
+pub(super) async fn qif(State(plant): State<Shared>, reader: Reader, Path(id): Path<String>) -> Response {
+    results(&plant, &reader, &id, "qif", "application/xml", |proof| &proof.qif).await
 }
 
-pub(super) async fn dfq(
-    State(plant): State<Shared>,
-    Extension(session): Extension<Session>,
-    Path(id): Path<String>,
-) -> Response {
-    results(&plant, &session, &id, "dfq", "text/plain; charset=utf-8", |proof| &proof.dfq).await
+pub(super) async fn dfq(State(plant): State<Shared>, reader: Reader, Path(id): Path<String>) -> Response {
+    results(&plant, &reader, &id, "dfq", "text/plain; charset=utf-8", |proof| &proof.dfq).await
 }
 
 async fn results(
     plant: &PlantPage,
-    session: &Session,
+    reader: &Reader,
     id: &str,
     ending: &str,
     kind: &'static str,
@@ -299,9 +352,9 @@ async fn results(
     match proof_of(plant, id).await {
         Ok((run, proof)) => match of(&proof) {
             Ok(text) => file(&format!("run-{}.{ending}", run.id), kind, text.clone()),
-            Err(reason) => not_made(session, reason),
+            Err(reason) => not_made(reader, reason),
         },
-        Err(reason) => unmade(session, &reason),
+        Err(reason) => unmade(reader, &reason),
     }
 }
 
@@ -313,9 +366,9 @@ pub(super) fn file(name: &str, kind: &'static str, content: String) -> Response 
 }
 
 /// Returns an error page with HTTP status 422 for a document that cannot be created from the plant's copy of a run.
-/// `reason` is the reason that the page shows. `session` is the session of the person who has signed in.
-fn not_made(session: &Session, reason: &str) -> Response {
-    let mut response = unmade(session, &PageError::NotHere(reason.to_owned()));
+/// `reason` is the reason that the page shows. `reader` is the reader of the page.
+fn not_made(reader: &Reader, reason: &str) -> Response {
+    let mut response = unmade(reader, &PageError::NotHere(Message::Words(reason.to_owned())));
     *response.status_mut() = StatusCode::UNPROCESSABLE_ENTITY;
     response
 }

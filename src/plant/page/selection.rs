@@ -4,21 +4,24 @@ use jiff::civil::Date;
 use jiff::tz::TimeZone;
 use jiff::{Timestamp, ToSpan};
 use maud::{Markup, html};
+use regrind_language::{Language, filled};
 use serde::Deserialize;
 
 use super::super::error::PlantError;
 use super::super::link::DatabaseLink;
-use super::page_error::PageError;
+use super::natural::natural_order;
+use super::page_error::{Message, PageError};
+use super::texts::Text;
 use super::words::{encoded, shown};
 
 /// Filters of parts: the column of the views, which is also the word in an address, and the label for people.
-const KINDS: [(&str, &str); 6] = [
-    ("recipe", "Recipe"),
-    ("cell", "Cell"),
-    ("grinder", "Grinder"),
-    ("cmm", "CMM"),
-    ("wheel", "Wheel"),
-    ("probe", "Probe"),
+const KINDS: [(&str, Text); 6] = [
+    ("recipe", Text::Recipe),
+    ("cell", Text::Cell),
+    ("grinder", Text::Grinder),
+    ("cmm", Text::Cmm),
+    ("wheel", Text::Wheel),
+    ("probe", Text::Probe),
 ];
 /// Day (UTC) on which a run began, as an expression on the views. The indexes of runs have it instead of the time: a
 /// condition names it, and an order begins with it.
@@ -133,30 +136,40 @@ impl Selection {
         query.join("&")
     }
 
-    /// Describes the selection in a short text for people, such as "recipe mirror, begun 2026-07-01 to 2026-07-04".
-    pub(super) fn words(&self) -> String {
+    /// Describes the selection in a short text for people, such as "Recipe mirror, begun 2026-07-01 to 2026-07-04 (UTC)".
+    pub(super) fn words(&self, language: Language) -> String {
         let named = KINDS.iter().zip(&self.names).filter(|(_, name)| !name.is_empty());
         let named: Vec<String> =
-            named.map(|((_, word), name)| format!("{} {}", word.to_lowercase(), shown(name))).collect();
-        let named = if named.is_empty() { "all parts".to_owned() } else { named.join(", ") };
-        format!("{named}, begun {} to {}", self.since, self.until)
+            named.map(|((_, word), name)| format!("{} {}", word.to(language), shown(name))).collect();
+        let named = if named.is_empty() { Text::AllParts.to(language).to_owned() } else { named.join(", ") };
+        let values: [(&str, &dyn std::fmt::Display); 3] =
+            [("parts", &named), ("since", &self.since), ("until", &self.until)];
+        filled(Text::BegunBetween.to(language), &values)
     }
 
     /// Renders the HTML form in which a person changes the selection. `action` is the address to which the form is
     /// sent. `kinds` are the keys of the filters that the form offers, such as `recipe` or `cell`. The form always
     /// offers the dates, and the choice of real or simulated parts. Returns an error if the plant cannot be reached.
-    pub(super) async fn form(&self, link: &DatabaseLink, action: &str, kinds: &[&str]) -> Result<Markup, PlantError> {
+    pub(super) async fn form(
+        &self,
+        link: &DatabaseLink,
+        action: &str,
+        kinds: &[&str],
+        language: Language,
+    ) -> Result<Markup, PlantError> {
+        let say = |text: Text| text.to(language);
         let rows = link.query("SELECT kind, name FROM choice ORDER BY kind, name LIMIT $1", &[&NAMES]).await?;
         let names: Vec<(&str, &str)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
-        let chosen = |(kind, word): &(&str, &str), name: &String| {
+        let chosen = |(kind, word): &(&str, Text), name: &String| {
             let mut known: Vec<&str> = names.iter().filter(|(of, _)| of == kind).map(|(_, name)| *name).collect();
             if !name.is_empty() && !known.contains(&name.as_str()) {
                 known.push(name);
             }
+            known.sort_by(|a, b| natural_order(a, b));
             html! {
-                label { (word) " "
+                label { (say(*word)) " "
                     select name=(kind) {
-                        option value="" { "any" }
+                        option value="" { (say(Text::Any)) }
                         @for each in known { option value=(each) selected[each == name] { (shown(each)) } }
                     }
                 }
@@ -165,19 +178,19 @@ impl Selection {
         Ok(html! {
             form .filter method="get" action=(action) {
                 @for (kind, name) in KINDS.iter().zip(&self.names).filter(|((kind, _), _)| kinds.contains(kind)) { (chosen(kind, name)) }
-                label { "Since " input type="date" name="since" value=(self.since); }
-                label { "Until " input type="date" name="until" value=(self.until); }
+                label { (say(Text::Since)) " " input type="date" name="since" value=(self.since); }
+                label { (say(Text::Until)) " " input type="date" name="until" value=(self.until); }
                 @if kinds.len() == KINDS.len() {
-                    label { "Measured " select name="at" {
-                        option value="last" { "when the part was judged last" }
-                        option value="first" selected[self.first] { "first, before any correction" }
+                    label { (say(Text::Measured)) " " select name="at" {
+                        option value="last" { (say(Text::AtLast)) }
+                        option value="first" selected[self.first] { (say(Text::AtFirst)) }
                     } }
                 }
-                label { "Parts " select name="parts" {
-                    option value="real" { "real" }
-                    option value="simulated" selected[self.simulated] { "simulated" }
+                label { (say(Text::Parts)) " " select name="parts" {
+                    option value="real" { (say(Text::Real)) }
+                    option value="simulated" selected[self.simulated] { (say(Text::Simulated)) }
                 } }
-                button { "Show" }
+                button { (say(Text::Show)) }
             }
         })
     }
@@ -225,7 +238,7 @@ fn day(text: &str) -> Result<Option<Date>, PageError> {
     }
     // Accepts only days that the database can represent.
     let found = text.parse::<Date>().ok().filter(|day| (1970..=9000).contains(&day.year()));
-    let bad = || PageError::Nonsense(format!("{text:?} is not a date; write it as 2026-07-04"));
+    let bad = || PageError::Nonsense(Message::Text(Text::NoDate, vec![("text", format!("{text:?}"))]));
     found.map(Some).ok_or_else(bad)
 }
 

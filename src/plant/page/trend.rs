@@ -1,23 +1,26 @@
 //! `/trend`: PV and RMS of consecutive parts, with control limits and tolerance.
 
-use axum::Extension;
 use axum::extract::{Query, State};
 use axum::response::Response;
 use maud::{Markup, html};
-use regrind_page::Session;
+use regrind_language::{Language, decimal, filled};
+use regrind_page::Reader;
 
 use super::super::error::PlantError;
 use super::super::link::DatabaseLink;
+use super::capability::{Distribution, Index, MIN_PARTS, NoCapability, capability};
 use super::content::{PageContent, page};
-use super::control_chart::{ENOUGH, Limits, Value, individuals, moving_ranges, ranges};
+use super::control_chart::{ENOUGH, Figure, Limits, Value, ranges};
+use super::nelson::{Broken, FALSE_ALARMS, RULES, broken_rules, expected_by_chance};
 use super::page_error::PageError;
 use super::selection::{ALL_KINDS, NEWEST_FIRST, Selection, SelectionQuery, mark};
 use super::shared::Shared;
-use super::words::{shown, um};
+use super::texts::Text;
+use super::words::{name, um, when};
 
-/// Maximum number of parts in a chart, and of parts in the list of those out of limits.
+/// Maximum number of parts in a chart, and of parts in the list of those that break a rule.
 const MAX_PARTS: i64 = 250;
-const LISTED: usize = 20;
+const LISTED: usize = 5;
 
 /// Query of parts by their last measurement, up to its first condition: those that were judged for good.
 const LAST_MEASURED: &str = "SELECT id, serial, cell, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), pv_um, pv_u_um, pv_limit_um, rms_um, rms_u_um, rms_limit_um
@@ -37,33 +40,35 @@ pub(super) struct Part {
 
 pub(super) async fn trend(
     State(plant): State<Shared>,
-    Extension(session): Extension<Session>,
+    reader: Reader,
     Query(asked): Query<SelectionQuery>,
 ) -> Response {
-    page(&session, made(&plant, &asked)).await
+    page(&reader, made(&plant, &asked, reader.language)).await
 }
 
-async fn made(plant: &Shared, asked: &SelectionQuery) -> Result<PageContent, PageError> {
+async fn made(plant: &Shared, asked: &SelectionQuery, language: Language) -> Result<PageContent, PageError> {
+    let say = |text: Text| text.to(language);
     let link = plant.lease().await?;
     let selection = Selection::from_query(&link, asked).await?;
-    let form = selection.form(&link, "/trend", &ALL_KINDS).await?;
+    let form = selection.form(&link, "/trend", &ALL_KINDS, language).await?;
     let parts = parts(&link, &selection, MAX_PARTS).await?;
     let main = html! {
         main .list .plant {
-            h1 { "Trend " (mark(selection.simulated)) }
+            h1 { (say(Text::Trend)) " " (mark(selection.simulated)) }
             (form)
-            p .quiet { (selection.words()) ": " (parts.len()) @if parts.len() == 1 { " part" } @else { " parts" } @if parts.len() as i64 == MAX_PARTS { ", the newest" } "." }
-            @if selection.recipe().is_empty() {
-                p .no { "Parts of several recipes are in one chart, so its control limits have no meaning. Choose a recipe." }
+            p .quiet {
+                (selection.words(language)) ": " (filled(say(if parts.len() == 1 { Text::OnePart } else { Text::CountParts }), &[("count", &parts.len())]))
+                @if parts.len() as i64 == MAX_PARTS { " " (say(Text::OnlyNewest)) }
             }
-            (charts(&parts))
+            @if selection.recipe().is_empty() { p .warns { (say(Text::RecipesInChart)) } }
+            (charts(&parts, &selection, language))
             p {
                 a href=(format!("/export.csv?{}", selection.query())) { "CSV" } " · "
                 a href=(format!("/trend.dfq?{}", selection.query())) { "DFQ (Q-DAS)" }
             }
         }
     };
-    Ok(PageContent { title: "Trend".into(), again_s: None, main })
+    Ok(PageContent { title: say(Text::Trend).into(), again_s: None, main })
 }
 
 /// Reads the `most` newest parts of a selection, by the start of their run. Returns the parts from the oldest to the
@@ -91,69 +96,179 @@ pub(super) async fn parts(link: &DatabaseLink, selection: &Selection, most: i64)
     Ok(rows.iter().rev().filter_map(part).collect())
 }
 
-fn charts(parts: &[Part]) -> Markup {
+fn charts(parts: &[Part], selection: &Selection, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
     let pv: Vec<Value> = parts.iter().map(|part| part.pv.clone()).collect();
     let rms: Vec<Value> = parts.iter().filter_map(|part| part.rms.clone()).collect();
     html! {
-        @if pv.len() < 2 { p { "There are too few parts for a chart: at least two are needed." } }
+        @if pv.len() < 2 { p { (say(Text::TooFewForChart)) } }
         @else if pv.len() < ENOUGH {
-            p .no { "Limits of " (pv.len()) " parts are preliminary: below " (ENOUGH) " they change much with each further part." }
+            p .warns { (filled(say(Text::PreliminaryLimits), &[("count", &pv.len()), ("enough", &ENOUGH)])) }
         }
-        (figure("PV", "pv", &pv))
-        (figure("RMS", "rms", &rms))
-        p .quiet {
-            "Limits: mean ± 2.660 times the mean moving range; limit of the range: 3.267 times its mean; from all parts of the chart. A triangle marks a point outside the limits. \
-             There is no lower limit if it would be below 0. The dotted line is the tolerance of the recipe; it has no effect on the limits."
+        @for (name, class, values) in [("PV", "pv", &pv), ("RMS", "rms", &rms)] {
+            (figure([name, class], values, selection, language))
+        }
+        @if pv.len() >= 2 {
+            p .quiet {
+                (say(Text::LimitsAre)) " " (say(Text::TimesAre)) " " span data-zone=(say(Text::LocalTime)) { "UTC" } ". "
+                (filled(say(Text::FalseAlarmsAre), &[("share", &decimal(100.0 * FALSE_ALARMS.iter().sum::<f64>(), 1, language))]))
+            }
         }
     }
 }
 
-fn figure(name: &str, class: &str, values: &[Value]) -> Markup {
+fn figure([name, class]: [&str; 2], values: &[Value], selection: &Selection, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
     let all: Vec<f64> = values.iter().map(|value| value.um).collect();
     let Some(limits) = Limits::from_values(&all) else { return Markup::default() };
-    let out: Vec<&Value> = values.iter().rev().filter(|value| limits.is_out(value.um)).collect();
-    let ranges_out: Vec<&Value> = ranges(&all)
+    let broken = broken_rules(&all, limits.zones());
+    let figure = Figure { name, class, values, limits: &limits, language };
+    let far = figure.tolerance().filter(|_| figure.tolerance_is_far());
+    html! {
+        section .card .figure data-figure=(name) {
+            h2 .unseen { (name) }
+            div .charts {
+                div .wide .newest { (figure.individuals(&broken)) }
+                @if let Some(limit) = far { p .quiet { (filled(say(Text::ToleranceIsAbove), &[("limit", &um(Some(limit), 2, language))])) } }
+                div .wide .newest { (figure.moving_ranges()) }
+            }
+            div .side {
+                (limits_of(&limits, values, language))
+                (capability_of(values, &broken, selection, language))
+                (rules_of(values, &broken, language))
+                (ranges_of(&all, values, &limits, language))
+            }
+        }
+    }
+}
+
+/// Lists the limits of a control chart, and how many parts are above their tolerance.
+fn limits_of(limits: &Limits, values: &[Value], language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    let number = |value: f64| um(Some(value), 3, language);
+    let over = values.iter().filter(|value| value.limit_um.is_some_and(|limit| value.um > limit)).count();
+    let limited = values.iter().filter(|value| value.limit_um.is_some()).count();
+    html! {
+        dl .about .limits {
+            dt { (say(Text::MeanOfChart)) } dd { strong { (number(limits.mean)) } " µm" }
+            dt { (say(Text::ControlLimits)) }
+            dd { @match limits.lower { Some(lower) => { strong { (number(lower)) } " – " } None => { "≤ " } } strong { (number(limits.upper)) } " µm" }
+            dt { (say(Text::MeanRange)) } dd { (number(limits.mean_range)) " µm (≤ " (number(limits.range_upper)) ")" }
+            dt { (say(Text::AboveTolerance)) } dd { (filled(say(Text::CountOfAll), &[("count", &over), ("all", &limited)])) }
+        }
+    }
+}
+
+/// Shows the capability of the process with its conditions.
+fn capability_of(values: &[Value], broken: &[Broken], selection: &Selection, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    let all: Vec<f64> = values.iter().map(|value| value.um).collect();
+    let limits: Vec<Option<f64>> = values.iter().map(|value| value.limit_um).collect();
+    let number = |value: f64| decimal(value, 2, language);
+    let shown = |index: Index| {
+        let [low, high] = index.interval.map(number);
+        html! { strong { (number(index.value)) } " (" (low) " – " (high) ")" }
+    };
+    let none = |reason: Text| html! { dd { "– " span .quiet { (filled(say(reason), &[("count", &MIN_PARTS)])) } } };
+    html! {
+        dl .about .capability {
+            dt { "Cp" } dd { "– " span .quiet { (say(Text::OneSided)) } }
+            dt { "Cpk" }
+            @if selection.recipe().is_empty() { (none(Text::CapabilityOneRecipe)) } @else {
+                @match capability(&all, &limits) {
+                    Ok(found) => {
+                        dd { (shown(found.within)) }
+                        dt { "Ppk" } dd { (shown(found.overall)) }
+                        dt { (say(Text::DistributionIs)) } dd { (say(distribution_text(found.distribution))) }
+                    }
+                    Err(reason) => { (none(no_capability_text(reason))) }
+                }
+            }
+        }
+        @if !selection.recipe().is_empty() && capability(&all, &limits).is_ok() { (control_of(broken, selection, language)) }
+    }
+}
+
+/// Says whether the process is in control: otherwise its capability predicts nothing.
+fn control_of(broken: &[Broken], selection: &Selection, language: Language) -> Markup {
+    let marked = broken.iter().filter(|broken| broken.any()).count();
+    let [mean, bound] = expected_by_chance(broken.len());
+    let counts: [(&str, &dyn std::fmt::Display); 3] =
+        [("count", &marked), ("all", &broken.len()), ("chance", &decimal(mean, 0, language))];
+    let text = if marked as f64 > bound { Text::NotInControl } else { Text::CheckRules };
+    html! {
+        @if marked > 0 { p .warns { (filled(text.to(language), &counts)) } }
+        @if !selection.first { p .quiet { (Text::CapabilityOfLoop.to(language)) } }
+    }
+}
+
+fn distribution_text(distribution: Distribution) -> Text {
+    match distribution {
+        Distribution::Normal => Text::NormalDistribution,
+        Distribution::LogNormal => Text::LogNormalDistribution,
+    }
+}
+
+fn no_capability_text(reason: NoCapability) -> Text {
+    match reason {
+        NoCapability::TooFewParts => Text::CapabilityTooFew,
+        NoCapability::NoLimit => Text::CapabilityNoLimit,
+        NoCapability::SeveralLimits => Text::CapabilitySeveralLimits,
+        NoCapability::NoSpread => Text::CapabilityNoSpread,
+        NoCapability::OtherDistribution => Text::CapabilityOtherDistribution,
+    }
+}
+
+/// Lists the broken rules in words, each with its newest parts.
+fn rules_of(values: &[Value], broken: &[Broken], language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    const WORDS: [Text; RULES] =
+        [Text::Rule1, Text::Rule2, Text::Rule3, Text::Rule4, Text::Rule5, Text::Rule6, Text::Rule7, Text::Rule8];
+    let places = |rule: usize| -> Vec<&Value> {
+        values.iter().zip(broken).rev().filter(|(_, broken)| broken.has(rule)).map(|(value, _)| value).collect()
+    };
+    let found: Vec<(usize, Text, Vec<&Value>)> =
+        (1..).zip(WORDS).map(|(rule, text)| (rule, text, places(rule))).filter(|(.., at)| !at.is_empty()).collect();
+    html! {
+        h3 { (say(Text::NelsonsRules)) }
+        @if found.is_empty() { p .quiet { (say(Text::NoRuleBroken)) } }
+        @for (rule, text, at) in &found {
+            details .rule data-rule=(rule) {
+                summary { strong .number { (rule) } " " (say(*text)) ": " (filled(say(Text::PointsNewest), &[("count", &at.len())])) }
+                (list(at, language))
+            }
+        }
+    }
+}
+
+/// Lists the moving ranges above their limit by the parts after the step.
+fn ranges_of(all: &[f64], values: &[Value], limits: &Limits, language: Language) -> Markup {
+    let above: Vec<&Value> = ranges(all)
         .iter()
         .zip(&values[1..])
         .rev()
         .filter(|(range, _)| **range > limits.range_upper)
         .map(|(_, value)| value)
         .collect();
-    let over = values.iter().filter(|value| value.limit_um.is_some_and(|limit| value.um > limit)).count();
     html! {
-        section data-figure=(name) {
-            h2 { (name) }
-            p .limits {
-                "mean " strong { (um(Some(limits.mean), 3)) } " µm, limits "
-                strong { (limits.lower.map_or("none".to_owned(), |lower| um(Some(lower), 3))) } " and " strong { (um(Some(limits.upper), 3)) }
-                " µm; mean range " (um(Some(limits.mean_range), 3)) " µm, its limit " (um(Some(limits.range_upper), 3)) " µm"
+        @if !above.is_empty() {
+            details .rule data-rule="range" {
+                summary { (filled(Text::RangesAbove.to(language), &[("count", &above.len()), ("all", &(values.len() - 1))])) }
+                (list(&above, language))
             }
-            div .wide { (individuals(name, class, values, &limits)) }
-            div .wide { (moving_ranges(name, class, values, &limits)) }
-            p {
-                (over) " of " (values.len()) " above what is allowed; " (out.len()) " out of limits"
-                @if !out.is_empty() { ", the newest first:" } @else { "." }
-            }
-            (list(&out))
-            p {
-                (ranges_out.len()) " of " (values.len() - 1) " ranges above their limit"
-                @if !ranges_out.is_empty() { ", with the part after the step, the newest first:" } @else { "." }
-            }
-            (list(&ranges_out))
         }
     }
 }
 
 /// Renders a list of the first parts of `values`, with links to their runs.
-fn list(values: &[&Value]) -> Markup {
+fn list(values: &[&Value], language: Language) -> Markup {
     html! {
-        @if !values.is_empty() {
-            ul .out {
-                @for value in values.iter().take(LISTED) {
-                    li {
-                        a href=(format!("/runs/{}", value.run)) { (shown(&value.serial)) } " " (value.when) ", " (shown(&value.cell)) ": "
-                        (format!("{:.3}", value.um)) " µm" @if let Some(u) = value.u_um { (format!(" ± {u:.3} µm")) }
-                    }
+        ul .out {
+            @for value in values.iter().take(LISTED) {
+                li {
+                    a href=(format!("/runs/{}", value.run)) { (name(&value.serial)) } " " (um(Some(value.um), 3, language)) " µm"
+                    @if let Some(u) = value.u_um { " ± " (um(Some(u), 3, language)) } " "
+                    span .quiet { (name(&value.cell)) " " (when(&value.when)) }
                 }
             }
         }
