@@ -321,6 +321,7 @@ fn crates_depend_downwards_only() {
                 "regrind-figures",
                 "regrind-formats",
                 "regrind-journal",
+                "regrind-language",
                 "regrind-page",
                 "regrind-report",
                 "regrind-trust",

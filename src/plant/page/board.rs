@@ -54,12 +54,14 @@ fn address(cell: &CellSummary) -> String {
 fn tile(k: usize, cell: &CellSummary, is_dense: bool, is_marked: bool, language: Language) -> Markup {
     let look = cell.display_state();
     let (name, word) = (shown(&cell.name), shown(&cell.state_word(language)));
+    // On a dense board only what calls for attention has a symbol.
+    let has_symbol = !is_dense || !matches!(look, DisplayState::Runs | DisplayState::Still);
     html! {
         li .cell .(look.class()) #(format!("c{k}")) data-cell=(name) {
             h3 {
-                svg .shape viewBox="0 0 24 24" aria-hidden="true" { path d=(look.shape()) {} }
+                @if has_symbol { svg .shape viewBox="0 0 24 24" aria-hidden="true" { path d=(look.shape()) {} } }
                 a .name href=(address(cell)) title=(name) { (name) }
-                @if is_marked && cell.simulation { span .simulation title="SIMULATION" { @if is_dense { "SIM" } @else { "SIMULATION" } } }
+                @if is_marked && cell.simulation { span .simulation title=(Text::Simulation.to(language)) { @if is_dense { "SIM" } @else { (Text::Simulation.to(language)) } } }
             }
             p .state title=(word) { strong { (word) @if cell.alarms > 0 && look != DisplayState::Silent { " · " (alarms(cell, language)) } } }
             @if !is_dense { (part_of_card(cell, look, language)) }

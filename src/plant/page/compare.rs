@@ -70,7 +70,7 @@ async fn made(
     let chances = chances(&cells);
     let main = html! {
         main .list .plant {
-            h1 { (say(Text::CellsCompared)) " " (mark(selection.simulated)) }
+            h1 { (say(Text::CellsCompared)) " " (mark(selection.simulated, language)) }
             (form)
             p .quiet { (filled(say(Text::OfEachCellNewest), &[("selection", &selection.words(language)), ("count", &PARTS)])) }
             @if selection.recipe().is_empty() {

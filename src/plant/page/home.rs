@@ -59,14 +59,14 @@ async fn made(plant: &Shared, asked: &HomeQuery, language: Language) -> Result<P
     let main = html! {
         main .list .plant .home {
             div .head {
-                h1 { (say(Text::Cells)) " " (mark(is_all_simulated(&cells))) }
+                h1 { (say(Text::Cells)) " " (mark(is_all_simulated(&cells), language)) }
                 p .tally { (cells::tally(&cells, language)) }
                 p .jump { @for (id, text) in sections { a href=(format!("#{id}")) { (filled(say(text), &[("days", &DAYS)])) } " " } }
             }
             (needs_person(&cells, language))
             (board(&cells, language))
             section .card #parts {
-                h2 { (filled(say(Text::PartsInDays), &[("days", &DAYS)])) " " (mark(simulated)) }
+                h2 { (filled(say(Text::PartsInDays), &[("days", &DAYS)])) " " (mark(simulated, language)) }
                 (counted.render(simulated, language))
             }
             div .pair {

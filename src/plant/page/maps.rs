@@ -200,7 +200,7 @@ fn side_by_side(maps: &[Map], language: Language) -> Markup {
             @for map in maps {
                 figure data-run=(map.run) {
                     figcaption {
-                        a href=(format!("/runs/{}", map.run)) { (name(&map.serial)) } @if map.cycle > 0 { ", " (Text::Cycle.to(language)) " " (map.cycle) } ", " (name(&map.cell)) ", " (name(&map.recipe)) " " (mark(map.simulation))
+                        a href=(format!("/runs/{}", map.run)) { (name(&map.serial)) } @if map.cycle > 0 { ", " (Text::Cycle.to(language)) " " (map.cycle) } ", " (name(&map.cell)) ", " (name(&map.recipe)) " " (mark(map.simulation, language))
                         br; (Text::JudgedAs.to(language)) " PV " (um(map.pv_um, 2, language)) " µm, RMS " (um(map.rms_um, 3, language)) " µm"
                     }
                     (drawn(map, MAX_SIZE_PX, limit, language))

@@ -93,7 +93,7 @@ fn rules_at(z: &[f64]) -> Broken {
 /// number that 99 of 100 such processes do not exceed.
 pub(super) fn expected_by_chance(points: usize) -> [f64; 2] {
     // A pattern that continues marks several points, so the number scatters more than that of independent events. The
-    // factors are from 20,000 simulated processes of 50 to 250 points, whose limits come from the same points.
+    // factors are from 6,000 simulated processes of 50 to 250 points, whose limits come from the same points.
     let mean = FALSE_ALARMS.iter().sum::<f64>() * points as f64;
     [mean, mean + 2.33 * (CLUSTERS * mean).sqrt() + 3.0]
 }
@@ -167,7 +167,7 @@ mod tests {
 
     #[test]
     fn false_alarms_as_often_as_stated() {
-        let values = normal_numbers(400_000, 1984);
+        let values = normal_numbers(250_000, 1984);
         let broken = broken_rules(&values, UNIT);
         for (rule, expected) in (1..).zip(FALSE_ALARMS) {
             let share = broken.iter().filter(|broken| broken.has(rule)).count() as f64 / values.len() as f64;

@@ -123,10 +123,10 @@ async fn made(plant: &Shared, id: i32, language: Language) -> Result<PageContent
     let title = if run.text(4).is_empty() { run.name.clone() } else { run.text(4).to_owned() };
     let main = html! {
         main .list .plant .of-run {
-            div .head { h1 { (shown(&title)) " " (mark(run.is_simulated())) } (verdict(&run, language)) }
+            div .head { h1 { (shown(&title)) " " (mark(run.is_simulated(), language)) } (verdict(&run, language)) }
             div .run-grid {
                 section .card .map {
-                    h2 { (say(Text::ErrorMap)) @if let Some(cycle) = shown_cycle { ", " (say(Text::Cycle)) " " (cycle) } " " (mark(run.is_simulated())) }
+                    h2 { (say(Text::ErrorMap)) @if let Some(cycle) = shown_cycle { ", " (say(Text::Cycle)) " " (cycle) } " " (mark(run.is_simulated(), language)) }
                     @match drawn { Some(drawn) => { (drawn) } None => { p .quiet { (say(Text::NoMapReported)) } } }
                     @if let [first, .., last] = maps[..] {
                         p { a href=(format!("/maps?run={id}:{first}&run={id}:{last}")) { (say(Text::FirstAndLastMap)) } }

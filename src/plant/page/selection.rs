@@ -221,8 +221,8 @@ async fn newest_recipe(link: &DatabaseLink, simulated: bool) -> Result<String, P
 }
 
 /// Renders the mark SIMULATION for simulated parts, and nothing for real parts.
-pub(super) fn mark(simulated: bool) -> Markup {
-    html! { @if simulated { span .simulation { "SIMULATION" } } }
+pub(super) fn mark(simulated: bool, language: Language) -> Markup {
+    html! { @if simulated { span .simulation { (Text::Simulation.to(language)) } } }
 }
 
 pub(super) fn today() -> Date {

@@ -28,7 +28,7 @@ regrind_language::texts! {
     OneScale SignOfMaps HashOfMaps NoMap MapMissing MapNotOnRecord MapNotArrived MapChanged DatabaseGone
     DatabaseRefused NotFound InvalidRequest CellsGoOn NoSuchRun NoRecordYet GiveNumber NameTheRuns
     NothingMeasured Alarms Began Cell Convergence Cycle Cycles Ended LastJudged Limit Operator Part Parts Plant
-    Probe Recipe Report Result Run Show Since Trend Until Wheel
+    Probe Recipe Report Result Run Show Since Trend Until Wheel Simulation
 }
 
 regrind_language::texts! {

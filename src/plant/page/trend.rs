@@ -54,7 +54,7 @@ async fn made(plant: &Shared, asked: &SelectionQuery, language: Language) -> Res
     let parts = parts(&link, &selection, MAX_PARTS).await?;
     let main = html! {
         main .list .plant {
-            h1 { (say(Text::Trend)) " " (mark(selection.simulated)) }
+            h1 { (say(Text::Trend)) " " (mark(selection.simulated, language)) }
             (form)
             p .quiet {
                 (selection.words(language)) ": " (filled(say(if parts.len() == 1 { Text::OnePart } else { Text::CountParts }), &[("count", &parts.len())]))

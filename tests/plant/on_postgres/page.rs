@@ -6,7 +6,7 @@ use std::process::Command;
 use std::time::Instant;
 
 use regrind::journal::sha256_hex;
-use regrind_testcell::browser::Browser;
+use regrind_testcell::browser::{Browser, Tab};
 use regrind_testcell::http::{Answer, Visitor, raw};
 use serde_json::Value;
 
@@ -39,6 +39,11 @@ impl ServedPage {
         let line = page.line("address of the page", |line| line.starts_with("page "));
         let url = line.trim_start_matches("page").trim().to_owned();
         Self { _page: page, visitor: Visitor::with_key(&url), url }
+    }
+
+    /// Returns the address of the page without its key, with a slash at its end.
+    fn base(&self) -> String {
+        self.url.split("?key=").next().unwrap().to_owned()
     }
 
     /// Returns the text of the page at a path.
@@ -677,7 +682,7 @@ fn cells_in_natural_order_keep_their_places() {
     // Enrolled in another order than the natural one.
     for k in [10, 2, 1, 12, 3, 11, 4, 9, 5, 8, 6, 7] {
         let cell = cell(&plant, &format!("cell-{k}"));
-        store_state(&plant, cell, "1 second", Some("run"), &grinding(&format!("SN-{k}")));
+        store_state(&plant, cell, "-1 hours", Some("run"), &grinding(&format!("SN-{k}")));
     }
     let natural: Vec<String> = (1..=12).map(|k| format!("cell-{k}")).collect();
     let shown = ServedPage::serve(&plant);
@@ -729,7 +734,7 @@ fn cells_in_natural_order_keep_their_places() {
 fn pages_in_each_language() {
     let plant = Plant::new();
     let one = cell(&plant, "cell-1");
-    store_state(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
+    store_state(&plant, one, "-1 hours", Some("run"), &grinding("SN-0042"));
     let runs: Vec<Planted> = (2..30).map(|hours| Planted { cell: one, hours, ..Planted::default() }).collect();
     let first = plant_runs(&plant, &runs);
     let shown = ServedPage::serve(&plant);
@@ -829,15 +834,40 @@ const WRONG: &str = "(() => { const wrong = []; const d = document.documentEleme
     if (Math.max(...steps) - Math.min(...steps) > 1) wrong.push(`rows of several heights: ${[...new Set(steps)]}`); \
     return wrong.slice(0, 5); })()";
 
+/// Expression for whether the last point of the first chart is on the screen.
+const NEWEST_IS_SHOWN: &str = "(() => { const points = [...document.querySelector('.figure .newest').querySelectorAll('circle, path')]; \
+    const b = points.pop().getBoundingClientRect(); return b.left >= 0 && b.right <= innerWidth; })()";
+
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql) and a browser (Debian package chromium)"]
 fn plant_pages_fit_every_screen() {
+    let (plant, run) = plant_with_long_texts();
+    let paths = ["", "trend", "cells", "parts?serial=SN", &format!("maps?run={run}"), &format!("runs/{run}")];
+    let (mut browser, tab, shown) = fits_every_screen(&plant, 20, &paths);
+    shows_local_time_and_keeps_details(&mut browser, &tab, &shown.base());
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql) and a browser (Debian package chromium)"]
+fn thousand_cells_fit_every_screen() {
+    let (plant, _) = plant_with_long_texts();
+    // The others are as one of the first twenty.
+    plant.sql(
+        "WITH made AS (INSERT INTO cell (name, role) SELECT 'cell-' || n, 'role_' || n FROM generate_series(21, 1000) n RETURNING id)
+         INSERT INTO cell_state (cell, at, run, snapshot) SELECT m.id, s.at, s.run, s.snapshot FROM made m JOIN cell_state s ON s.cell = 1 + m.id % 20",
+    );
+    fits_every_screen(&plant, 1000, &["", "trend", "cells"]);
+}
+
+/// Returns a plant of twenty cells in each state, some with long names, and with long serial numbers and incidents; and
+/// the number of its first run.
+fn plant_with_long_texts() -> (Plant, i32) {
     let plant = Plant::new();
     let name = |k: u32| if k == 3 { format!("cell-3 {}", "long".repeat(18)) } else { format!("cell-{k}") };
     let state = |k: u32| match k % 5 {
         0 => serde_json::json!({ "state": "Held", "alarms": [{}], "next_step": { "step": "clear_alarm" } }),
         1 => serde_json::json!({ "state": "Idle" }),
-        2 => serde_json::json!({ "next_step": { "step": "load" }, "phase": "load" }),
+        2 | 3 => serde_json::json!({ "next_step": { "step": "load" }, "phase": "load" }),
         _ => serde_json::json!({}),
     };
     for k in 1..=20 {
@@ -856,54 +886,39 @@ fn plant_pages_fit_every_screen() {
     ));
     plant.sql("INSERT INTO recipe (sha256, name, version, text) VALUES (recipe_sha256('mirror', 1, 'a', '{}'), 'mirror', 1, 'a')");
     plant.sql(&format!("INSERT INTO work (serial, recipe) SELECT '{serial}', sha256 FROM recipe"));
-    let shown = ServedPage::serve(&plant);
+    (plant, first)
+}
+
+/// Looks at pages of a plant of `cells` cells at three widths. Nothing may be wider than the screen. Returns the browser,
+/// its tab, and the address of the page.
+fn fits_every_screen(plant: &Plant, cells: usize, paths: &[&str]) -> (Browser, Tab, ServedPage) {
+    let shown = ServedPage::serve(plant);
+    let base = shown.base();
     let mut browser = Browser::start(plant.home.path());
     let tab = browser.open(&shown.url, [1366, 768]);
-    tab.until(&mut browser, "document.querySelector('.cell .left')");
-    let base = shown.url.split("?key=").next().unwrap().to_owned();
-    let paths = ["", "trend", "cells", "parts?serial=SN", &format!("maps?run={first}"), &format!("runs/{first}")];
-    for cells in [20, 1000] {
-        if cells > 20 {
-            // The others are as one of the first twenty.
-            plant.sql(
-                "WITH made AS (INSERT INTO cell (name, role) SELECT 'cell-' || n, 'role_' || n FROM generate_series(21, 1000) n RETURNING id)
-                 INSERT INTO cell_state (cell, at, run, snapshot) SELECT m.id, s.at, s.run, s.snapshot FROM made m JOIN cell_state s ON s.cell = 1 + m.id % 20",
-            );
-        }
-        for [width, height] in [[1920, 1080], [1366, 768], [390, 844]] {
-            let size =
-                serde_json::json!({ "width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600 });
-            tab.send(&mut browser, "Emulation.setDeviceMetricsOverride", size);
-            // Only the board and the comparison depend on the number of cells.
-            for path in &paths[..if cells > 20 { 3 } else { paths.len() }] {
-                tab.send(&mut browser, "Page.navigate", serde_json::json!({ "url": format!("{base}{path}") }));
-                tab.until(
-                    &mut browser,
-                    &format!("document.readyState == 'complete' && location.href == '{base}{path}'"),
-                );
-                let wrong = tab.read(&mut browser, WRONG);
-                assert_eq!(wrong, serde_json::json!([]), "/{path} with {cells} cells at {width} px");
-                if *path == "trend" {
-                    // The last point of the chart is on the screen.
-                    let last = "(() => { const b = [...document.querySelectorAll('.figure .newest')[0].querySelectorAll('circle, path')].pop().getBoundingClientRect(); \
-                        return b.left >= 0 && b.right <= innerWidth; })()";
-                    assert_eq!(tab.read(&mut browser, last), true, "the newest point at {width} px");
-                }
+    tab.until(&mut browser, &format!("document.querySelectorAll('.cells > .cell').length == {cells}"));
+    for [width, height] in [[1920, 1080], [1366, 768], [390, 844]] {
+        let size =
+            serde_json::json!({ "width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600 });
+        tab.send(&mut browser, "Emulation.setDeviceMetricsOverride", size);
+        for path in paths {
+            tab.send(&mut browser, "Page.navigate", serde_json::json!({ "url": format!("{base}{path}") }));
+            tab.until(&mut browser, &format!("document.readyState == 'complete' && location.href == '{base}{path}'"));
+            let wrong = tab.read(&mut browser, WRONG);
+            assert_eq!(wrong, serde_json::json!([]), "/{path} with {cells} cells at {width} px");
+            if *path == "trend" {
+                assert_eq!(tab.read(&mut browser, NEWEST_IS_SHOWN), true, "the newest point at {width} px");
             }
         }
-        let places = "document.querySelectorAll('.cells > .cell').length";
-        tab.send(&mut browser, "Page.navigate", serde_json::json!({ "url": base }));
-        tab.until(&mut browser, &format!("{places} == {cells}"));
     }
     assert_eq!(tab.problems(&browser), Vec::<String>::new());
-    shows_local_time_and_keeps_details(&mut browser, &tab, &base);
+    (browser, tab, shown)
 }
 
 /// Checks that times are those of the reader, and that an open detail stays open while the page fetches itself again.
-fn shows_local_time_and_keeps_details(browser: &mut Browser, tab: &regrind_testcell::browser::Tab, base: &str) {
+fn shows_local_time_and_keeps_details(browser: &mut Browser, tab: &Tab, base: &str) {
     tab.send(browser, "Emulation.setTimezoneOverride", serde_json::json!({ "timezoneId": "Asia/Kolkata" }));
-    tab.send(browser, "Page.navigate", serde_json::json!({ "url": format!("{base}#more-needs") }));
-    tab.send(browser, "Page.reload", serde_json::json!({}));
+    tab.send(browser, "Page.navigate", serde_json::json!({ "url": base }));
     tab.until(browser, "document.readyState == 'complete' && document.querySelector('.incidents time[title]')");
     let time = "(() => { const t = document.querySelector('.incidents time'); const u = new Date(t.dateTime); \
         const local = new Date(u.getTime() + 330 * 60000); const mm = String(local.getUTCMinutes()).padStart(2, '0'); \
