@@ -951,7 +951,7 @@ fn plant_pictures_are_made() {
         told.as_object_mut().unwrap().extend(state.as_object().unwrap().clone());
         told["simulation"] = true.into();
         let run = (state["state"] != "Idle").then_some("run");
-        store_state(&plant, cell, if k == 7 { "4 hours" } else { "0 seconds" }, run, &told);
+        store_state(&plant, cell, if k == 7 { "4 hours" } else { "-1 hours" }, run, &told);
     }
     let serials: Vec<String> = (0..160).map(|k| format!("SN-{k:04}")).collect();
     let run = |k: u32| Planted {
