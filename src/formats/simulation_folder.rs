@@ -6,6 +6,7 @@ use tempfile::TempDir;
 
 use super::error::FormatError;
 use super::registration::write_private;
+use super::system::create_owners_folder;
 
 /// Temporary folder that only its owner can read. It is deleted with its content when the value is dropped.
 #[derive(Debug)]
@@ -20,17 +21,7 @@ impl SimulationFolder {
     pub fn create(text: &str) -> Result<Self, FormatError> {
         let home = std::env::temp_dir();
         let failed = |source| FormatError::Unwritable { path: home.clone(), action: "creating a folder in it", source };
-        let mut builder = tempfile::Builder::new();
-        builder.prefix("regrind-");
-        // On Windows, the folder for temporary files is that of the user.
-        #[cfg(unix)]
-        let owner_only = {
-            use std::os::unix::fs::PermissionsExt;
-            std::fs::Permissions::from_mode(0o700)
-        };
-        #[cfg(unix)]
-        builder.permissions(owner_only);
-        let folder = Self(builder.tempdir_in(&home).map_err(failed)?);
+        let folder = Self(create_owners_folder("regrind-", &home).map_err(failed)?);
         write_private(&folder.draft(), text.as_bytes())?;
         Ok(folder)
     }
@@ -48,6 +39,7 @@ impl SimulationFolder {
 
 #[cfg(test)]
 mod tests {
+    use super::super::system::readable_by_others;
     use super::*;
 
     #[test]
@@ -55,11 +47,7 @@ mod tests {
         let folder = SimulationFolder::create("[part]\n").unwrap();
         assert_eq!(std::fs::read_to_string(folder.draft()).unwrap(), "[part]\n");
         let home = folder.draft().parent().unwrap().to_owned();
-        #[cfg(unix)]
-        {
-            use std::os::unix::fs::PermissionsExt;
-            assert_eq!(std::fs::metadata(&home).unwrap().permissions().mode() & 0o077, 0);
-        }
+        assert_eq!(readable_by_others(&home).unwrap().map(|open| open.how), None);
         drop(folder);
         assert!(!home.exists());
     }

@@ -2,14 +2,21 @@
 
 use std::fs::{self, File, OpenOptions};
 use std::io;
-use std::os::unix::fs::{FileTypeExt, MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{FileTypeExt, MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::Path;
+
+use tempfile::TempDir;
 
 use super::OpenToOthers;
 
 /// Creates a file that only its owner can read and write, and opens it for writing. An existing file is an error.
 pub(crate) fn create_owners(path: &Path) -> io::Result<File> {
     OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
+}
+
+/// Creates a folder in `parent` that only its owner can read. Its name begins with `prefix`.
+pub(crate) fn create_owners_folder(prefix: &str, parent: &Path) -> io::Result<TempDir> {
+    tempfile::Builder::new().prefix(prefix).permissions(fs::Permissions::from_mode(0o700)).tempdir_in(parent)
 }
 
 pub(super) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>> {

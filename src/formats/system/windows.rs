@@ -5,11 +5,19 @@ use std::fs::{self, File};
 use std::io;
 use std::path::Path;
 
+use tempfile::TempDir;
+
 use super::OpenToOthers;
 
 /// Creates a file that only its owner can read, and opens it for writing. An existing file is an error.
 pub(crate) fn create_owners(path: &Path) -> io::Result<File> {
     regrind_windows::create_owners_file(path)
+}
+
+/// Creates a folder in `parent`. Its name begins with `prefix`. The folder for temporary files is that of the user, who
+/// alone can read what is in it.
+pub(crate) fn create_owners_folder(prefix: &str, parent: &Path) -> io::Result<TempDir> {
+    tempfile::Builder::new().prefix(prefix).tempdir_in(parent)
 }
 
 /// Returns true if the full paths of `one` and `other`, with all links followed, are equal. Two names of one file by a
