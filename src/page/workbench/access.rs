@@ -24,16 +24,16 @@ pub(super) fn refused(status: StatusCode, message: impl Into<String>) -> Respons
 ///
 /// # Errors
 /// Returns the response to the browser if the page has no folder of recipes, or if the person is no engineer.
-pub(super) fn for_engineer<'p>(page: &'p Page, session: &Session) -> Result<&'p Workbench, Response> {
+pub(super) fn for_engineer<'p>(page: &'p Page, session: &Session) -> Result<&'p Workbench, Box<Response>> {
     let Some(workbench) = &page.workbench else {
         let message = "this page has no folder of recipes; start it with `regrind serve --recipes DIR`";
-        return Err(refused(StatusCode::NOT_FOUND, message));
+        return Err(Box::new(refused(StatusCode::NOT_FOUND, message)));
     };
     if !session.is_engineer() {
         let who = session.person.as_ref().map(ToString::to_string).unwrap_or_default();
         // The refusal is in the log of the page; it concerns no run.
         page.guard.refused(&format!("a request of the workbench from {who}"));
-        return Err(refused(StatusCode::FORBIDDEN, "only an engineer can use the recipes"));
+        return Err(Box::new(refused(StatusCode::FORBIDDEN, "only an engineer can use the recipes")));
     }
     Ok(workbench)
 }

@@ -64,7 +64,7 @@ pub(crate) async fn draft(
     }
     let workbench = match for_engineer(&page, &session) {
         Ok(workbench) => workbench,
-        Err(response) => return response,
+        Err(response) => return *response,
     };
     let Some(path) = workbench.recipes.file(&name) else {
         return refused(StatusCode::NOT_FOUND, "this is no name for a recipe");

@@ -38,7 +38,7 @@ pub(crate) async fn save(
     }
     let workbench = match for_engineer(&page, &session) {
         Ok(workbench) => workbench,
-        Err(response) => return response,
+        Err(response) => return *response,
     };
     let Ok(ToSave { text, replaces }) = serde_json::from_slice(&body) else {
         return refused(StatusCode::BAD_REQUEST, "the request is not that of this page; load the page again");
@@ -54,7 +54,7 @@ pub(crate) async fn save(
 pub(crate) async fn schema(State(page): State<Shared>, Extension(session): Extension<Session>) -> Response {
     match for_engineer(&page, &session) {
         Ok(workbench) => Json(workbench.programs.schema()).into_response(),
-        Err(response) => response,
+        Err(response) => *response,
     }
 }
 
@@ -75,7 +75,7 @@ pub(crate) async fn versions(
 ) -> Response {
     let recipes = match for_engineer(&page, &session) {
         Ok(workbench) => workbench.recipes.clone(),
-        Err(response) => return response,
+        Err(response) => return *response,
     };
     on_disk(recipes, move |recipes| recipes.versions(&name))
         .await
@@ -99,7 +99,7 @@ async fn served(
 ) -> Response {
     let recipes = match for_engineer(page, session) {
         Ok(workbench) => workbench.recipes.clone(),
-        Err(response) => return response,
+        Err(response) => return *response,
     };
     match on_disk(recipes, read).await {
         Ok(Some(text)) => plain(text),

@@ -52,7 +52,7 @@ pub(crate) async fn begin(
 ) -> Response {
     let workbench = match permitted(&page, &session, &headers) {
         Ok(workbench) => workbench,
-        Err(response) => return response,
+        Err(response) => return *response,
     };
     let Ok(ToSimulate { text, seed }) = serde_json::from_slice(&body) else {
         return refused(StatusCode::BAD_REQUEST, "the request is not that of this page; load the page again");
@@ -84,16 +84,16 @@ pub(crate) async fn end(
 ) -> Response {
     let workbench = match permitted(&page, &session, &headers) {
         Ok(workbench) => workbench,
-        Err(response) => return response,
+        Err(response) => return *response,
     };
     workbench.simulation().take_if(|simulation| simulation.name == name);
     StatusCode::NO_CONTENT.into_response()
 }
 
-fn permitted<'p>(page: &'p Shared, session: &Session, headers: &HeaderMap) -> Result<&'p Workbench, Response> {
+fn permitted<'p>(page: &'p Shared, session: &Session, headers: &HeaderMap) -> Result<&'p Workbench, Box<Response>> {
     if let Some(what) = foreign(&page.guard, headers, session) {
         page.guard.refused(&what);
-        return Err(refused(StatusCode::FORBIDDEN, what));
+        return Err(Box::new(refused(StatusCode::FORBIDDEN, what)));
     }
     for_engineer(page, session)
 }
@@ -116,7 +116,7 @@ pub(crate) async fn events(
     headers: HeaderMap,
 ) -> Response {
     if let Err(response) = for_engineer(&page, &session) {
-        return response;
+        return *response;
     }
     let looking = SimulationEvents { language: language(&headers), page, session, name, sent: None };
     Sse::new(unfold(looking, |mut looking| async {
@@ -227,7 +227,7 @@ async fn of_run<T: Send + 'static>(
     name: &str,
     read: impl FnOnce(&std::path::Path, &ObservedRun) -> Option<T> + Send + 'static,
 ) -> Result<T, Response> {
-    let workbench = for_engineer(page, session)?;
+    let workbench = for_engineer(page, session).map_err(|response| *response)?;
     let found = {
         let simulation = workbench.simulation();
         let simulation = simulation.as_ref().filter(|simulation| simulation.name == name);

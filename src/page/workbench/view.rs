@@ -44,7 +44,7 @@ pub(crate) async fn list(
     let language = language(&headers);
     let workbench = match available(&page, &session, language) {
         Ok(workbench) => workbench,
-        Err(response) => return response,
+        Err(response) => return *response,
     };
     let mut last_runs = last_runs(&page).await;
     let listed = saving::on_disk(workbench.recipes.clone(), move |recipes| {
@@ -77,7 +77,7 @@ pub(crate) async fn open(
 ) -> Response {
     let workbench = match available(&page, &session, language(&headers)) {
         Ok(workbench) => workbench,
-        Err(response) => return response,
+        Err(response) => return *response,
     };
     let name = name.trim();
     let name = if name.ends_with(".toml") { name.to_owned() } else { format!("{name}.toml") };
@@ -91,7 +91,7 @@ pub(crate) async fn open(
 ///
 /// # Errors
 /// Returns the page that says why not.
-fn available<'p>(page: &'p Shared, session: &Session, language: Language) -> Result<&'p Workbench, Response> {
+fn available<'p>(page: &'p Shared, session: &Session, language: Language) -> Result<&'p Workbench, Box<Response>> {
     let reason = match &page.workbench {
         Some(workbench) if session.is_engineer() => return Ok(workbench),
         Some(_) => WorkbenchText::OnlyEngineer,
@@ -99,7 +99,7 @@ fn available<'p>(page: &'p Shared, session: &Session, language: Language) -> Res
     };
     let title = Text::Recipes.to(language);
     let main = html! { main .list { h1 { (title) } p { (reason.to(language)) } } };
-    Err(plain_document(title, session, language, main))
+    Err(Box::new(plain_document(title, session, language, main)))
 }
 
 fn recipe_list(workbench: &Workbench, listed: &[ListedRecipe], language: Language) -> Markup {
@@ -174,7 +174,7 @@ pub(crate) async fn recipe(
     let language = language(&headers);
     let workbench = match available(&page, &session, language) {
         Ok(workbench) => workbench,
-        Err(response) => return response,
+        Err(response) => return *response,
     };
     if workbench.recipes.file(&name).is_none() {
         return not_here(PageSubject::Cell, &headers);

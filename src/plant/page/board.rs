@@ -213,7 +213,7 @@ mod tests {
     #[test]
     fn texts_of_cells_are_escaped() {
         let odd = CellSummary { next_step: "odd".into(), next: "<b>".into(), ..cell("Execute", Some(1.0), 0) };
-        for html in [board(&[odd.clone()], Language::En), needs_person(&[odd], Language::En)] {
+        for html in [board(std::slice::from_ref(&odd), Language::En), needs_person(&[odd], Language::En)] {
             let html = html.into_string();
             assert!(
                 !html.contains("<script>")

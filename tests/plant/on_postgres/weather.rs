@@ -214,7 +214,7 @@ fn weather(seed: u64, cells: usize, parts: usize) {
     });
     network.mend();
     println!("seed {seed}: {events} events of the weather");
-    study.is_done(&plant, parts);
+    study.finish(&plant, parts);
     let archived = unarchive(&plant);
     println!("seed {seed}: {archived} runs were archived meanwhile");
     is_once_and_whole(&plant, &cells, parts, seed);
@@ -238,9 +238,9 @@ impl Study {
         Self { worker: Running::new(regrind(&work, plant.home.path())) }
     }
 
-    /// Asserts that the worker has survived everything, and that each of the `seeds` runs of the study has a result. The
+    /// Waits for the end of the study. Asserts that the worker has survived everything, and that each of the `seeds` runs of the study has a result. The
     /// cells can have kept the worker from the processors, so it has time as long as it makes runs.
-    fn is_done(mut self, plant: &Plant, seeds: usize) {
+    fn finish(mut self, plant: &Plant, seeds: usize) {
         let count = |state: &str| plant.sql(&format!("SELECT count(*) FROM study_job WHERE state IN ({state})"));
         let mut open = count("'open', 'leased'");
         println!("{open} of {seeds} runs of the study are left");
