@@ -21,6 +21,7 @@ pub struct Alarm {
 
 /// Role that may clear an alarm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Role {
@@ -36,6 +37,7 @@ macro_rules! catalogue {
     ($($(#[$doc:meta])* $id:ident { $head:literal, $consequence:literal, $clears:ident, [$($remedy:literal),+ $(,)?] })+) => {
         /// Kinds of alarm.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
         #[serde(rename_all = "snake_case")]
         pub enum AlarmId {
             $($(#[$doc])* $id,)+

@@ -287,6 +287,7 @@ impl State {
 
 /// Names of the states in PackML, without their phases.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[allow(missing_docs)]
 pub enum StateName {
     #[default]
@@ -305,6 +306,27 @@ pub enum StateName {
     Aborted,
     Completing,
     Complete,
+}
+
+impl StateName {
+    /// All states.
+    pub const ALL: [Self; 15] = [
+        Self::Idle,
+        Self::Starting,
+        Self::Execute,
+        Self::Holding,
+        Self::Held,
+        Self::Unholding,
+        Self::Suspending,
+        Self::Suspended,
+        Self::Unsuspending,
+        Self::Stopping,
+        Self::Stopped,
+        Self::Aborting,
+        Self::Aborted,
+        Self::Completing,
+        Self::Complete,
+    ];
 }
 
 impl fmt::Display for StateName {

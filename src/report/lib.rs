@@ -63,7 +63,10 @@ pub use label::{label_language, run_label, write_run_label};
 pub use pdf::{Paper, pdf_language, run_report_pdf, write_run_report_pdf};
 pub use plot::{Axis, Plot, Series};
 pub use ply::{coloured_ply, save_coloured_ply};
-pub use record_lines::{RecordChoice, RecordLine, RecordVerification, record_lines, verify_record};
+pub use record_lines::{
+    RecordChoice, RecordEntry, RecordLine, RecordVerification, record_count, record_entries, record_lines,
+    verify_record,
+};
 use regrind_formats::{FormatError, write_atomic};
 pub use regrind_journal::{Stamp as RecordStamp, has_record, stamp as record_stamp};
 pub use regrind_language::Language;

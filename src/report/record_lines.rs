@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::path::Path;
 
 use regrind_journal::{JournalError, Reader, Record, RecordKind, verify};
+use serde_json::Value;
 
 use super::words;
 
@@ -92,6 +93,63 @@ fn line(record: &Record) -> RecordLine {
         cycle: record.cycle,
         words: words(record),
     }
+}
+
+/// Record of a run for a program that reads it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RecordEntry {
+    /// Record as a line for a person.
+    pub line: RecordLine,
+    /// Number of the command that the record belongs to.
+    pub command_id: Option<u32>,
+    /// Reason in words; can be empty.
+    pub reason: String,
+    /// Content, as it is recorded.
+    pub content: Value,
+    /// Hash of the record.
+    pub hash: String,
+}
+
+/// Returns the records of the run in `folder` that `choice` includes, from the record after the number `after` on, in
+/// their order. Returns at most `count` of them, and ends earlier as soon as their contents have more than `max_bytes`.
+/// Also returns the number of the last record that was looked at; it is `after` if there is no further one.
+///
+/// # Errors
+/// Returns an error if the journal cannot be read.
+pub fn record_entries(
+    folder: &Path,
+    choice: RecordChoice,
+    after: u64,
+    (count, max_bytes): (usize, usize),
+) -> Result<(Vec<RecordEntry>, u64), JournalError> {
+    let (mut entries, mut last, mut bytes) = (Vec::new(), after, 0);
+    let reader = Reader::open(folder)?;
+    for record in reader.records(after.saturating_add(1)) {
+        let record = record?;
+        last = record.seq;
+        if choice.includes(&record) {
+            bytes += record.payload.len();
+            entries.push(entry(record));
+        }
+        if entries.len() >= count || bytes > max_bytes {
+            break;
+        }
+    }
+    Ok((entries, last))
+}
+
+/// Returns the number of the last record of the run in `folder`; 0 if it has none.
+///
+/// # Errors
+/// Returns an error if the journal cannot be read.
+pub fn record_count(folder: &Path) -> Result<u64, JournalError> {
+    Ok(Reader::open(folder)?.last()?.map_or(0, |record| record.seq))
+}
+
+fn entry(record: Record) -> RecordEntry {
+    let (line, content) = (line(&record), record.value());
+    let Record { command_id, reason, hash, .. } = record;
+    RecordEntry { line, command_id, reason, content, hash }
 }
 
 /// Result of the verification of the record of a run.

@@ -42,6 +42,8 @@ pub(super) struct RunHistory {
     pub(super) pass: Option<PassHistory>,
     /// Time of the last record.
     pub(super) last: String,
+    /// Job of each machine that has started: the opening of the journal, and the time in nanoseconds since the run began.
+    started: [Option<(String, u64)>; 2],
 }
 
 /// Progress of a pass.
@@ -79,6 +81,8 @@ pub(super) struct CycleHistory {
     pub(super) conditions: Option<String>,
     /// Root mean square of the error that is left for the map in addition to the parameters, in millimetres.
     pub(super) map_rms_mm: Option<f64>,
+    /// Total duration of the jobs of each machine in seconds: CMM, grinder.
+    pub(super) job_s: [Option<f64>; 2],
 }
 
 /// Measurement of a cycle: its figures, or the reason why there are none.
@@ -256,8 +260,27 @@ impl RunHistory {
         }
     }
 
+    /// Adds the start or the end of a job to the durations of its cycle. The times of two records are comparable only if
+    /// the same program wrote both.
+    fn add_job_time(&mut self, record: &Record, event: &Event) {
+        match event {
+            Event::Started { device, .. } => {
+                self.started[*device as usize] = Some((record.boot_id.clone(), record.mono_ns));
+            }
+            Event::Ended { device, cycle, .. } => {
+                let Some((boot_id, since_ns)) = self.started[*device as usize].take() else { return };
+                let Some(ns) = record.mono_ns.checked_sub(since_ns).filter(|_| boot_id == record.boot_id) else {
+                    return;
+                };
+                *self.cycle(*cycle).job_s[*device as usize].get_or_insert(0.0) += 1e-9 * ns as f64;
+            }
+            _ => {}
+        }
+    }
+
     fn add_event(&mut self, record: Record, told: EventRecord) {
         let EventRecord { event, detail } = told;
+        self.add_job_time(&record, &event);
         match event {
             Event::Collected { cycle, gate, .. } => {
                 let unusable = Some(&gate).filter(|gate| **gate != GateResult::Passed).map(gate_words);

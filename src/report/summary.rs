@@ -5,7 +5,7 @@ use std::path::Path;
 use super::ReportError;
 use super::run_history::{AlarmHistory, CycleHistory, HoldOrder, RunHistory};
 use super::words::{ending_words, home_words, recorded_name};
-use regrind_cell::{Ending, Tolerance, Verdict};
+use regrind_cell::{ComparedFigure, Device, Ending, Tolerance, Verdict};
 use regrind_journal::{Reader, Record};
 use regrind_record::PassFigures;
 
@@ -98,6 +98,11 @@ pub struct CycleSummary {
     pub reason: String,
     /// PV and RMS, each with its expanded uncertainty, as they were judged; `None` if nothing was measured.
     pub figures: Option<[[f64; 2]; 2]>,
+    /// PV and RMS, each with its interval, its limit and its conformity; `None` if nothing was measured, or if the tolerance
+    /// is not on record. Unit: millimetres.
+    pub judged: Option<[ComparedFigure; 2]>,
+    /// Number of points used, and number of outliers; `None` if nothing was measured.
+    pub points: Option<[u32; 2]>,
     /// Outliers that these figures do not include, with their positions and deviations; `None` if all points are
     /// included.
     pub left_out: Option<String>,
@@ -111,6 +116,21 @@ pub struct CycleSummary {
     pub pass: Option<PassFigures>,
     /// Error of the probe's radius on the reference sphere; `None` if it was not measured.
     pub radius_error_um: Option<f64>,
+    /// Total duration of the jobs of each machine in seconds (CMM, grinder), by the times of their records; `None` if no
+    /// job has a start and an end that one program recorded.
+    pub job_s: [Option<f64>; 2],
+}
+
+impl CycleSummary {
+    /// Returns the total duration of the measurements of the cycle, in seconds; `None` if it is not known.
+    pub fn measurement_s(&self) -> Option<f64> {
+        self.job_s[Device::Cmm as usize]
+    }
+
+    /// Returns the duration of the pass of the cycle, in seconds; `None` if it is not known.
+    pub fn pass_s(&self) -> Option<f64> {
+        self.job_s[Device::Grinder as usize]
+    }
 }
 
 impl CycleSummary {
@@ -180,7 +200,8 @@ fn cycle_summary(cycle: u32, story: &CycleHistory, tolerance: Option<&Tolerance>
     let last = story.measurements.last();
     let judgement = last.and_then(|of| of.judgements.last());
     let unusable = || last.and_then(|of| of.unusable.clone()).unwrap_or_default();
-    let figures = last.and_then(|of| of.figures.as_ref()).map(|figures| {
+    let found = last.and_then(|of| of.figures.as_ref());
+    let figures = found.map(|figures| {
         let points = [[figures.pv_mm, figures.pv_expanded_mm], [figures.rms_mm, figures.rms_expanded_mm]];
         let of = |tolerance: &Tolerance| tolerance.compare(figures).map(|of| [of.median_mm, of.expanded_mm]);
         tolerance.map_or(points, of).map(|figure| figure.map(|mm| 1e3 * mm))
@@ -190,11 +211,14 @@ fn cycle_summary(cycle: u32, story: &CycleHistory, tolerance: Option<&Tolerance>
         verdict: judgement.map(|judgement| judgement.verdict),
         reason: judgement.map_or_else(unusable, |judgement| judgement.reason.clone()),
         figures,
-        left_out: last.and_then(|of| of.figures.as_ref()?.with_outliers.as_ref()).map(|of| of.description.clone()),
+        judged: found.zip(tolerance).map(|(figures, tolerance)| tolerance.compare(figures)),
+        points: found.map(|figures| [figures.points, figures.outliers]),
+        left_out: found.and_then(|figures| figures.with_outliers.as_ref()).map(|of| of.description.clone()),
         expected: story.expected_mm.map(|figures| figures.map(|mm| 1e3 * mm)),
         map: story.map.as_ref().map(|(name, _)| name.clone()),
         deviations: story.deviations.clone(),
         pass: story.pass,
         radius_error_um: story.radius_error_mm.map(|mm| 1e3 * mm),
+        job_s: story.job_s,
     }
 }
