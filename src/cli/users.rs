@@ -1,4 +1,4 @@
-//! `regrind users`: the users who can sign in to the page from another computer, and their roles.
+//! `regrind users`: the users who can sign in to the page from another computer, their roles, and the tokens of programs.
 
 use std::io::{self, BufRead, IsTerminal};
 use std::path::{Path, PathBuf};
@@ -11,15 +11,17 @@ use serde_json::json;
 use super::Outcome;
 use super::failure::Failure;
 
-/// Manage the users who may sign in to the page of the cell
+/// Manage the users who may sign in to the page of the cell, and the tokens of programs that read it
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Roles: a viewer reads the page and gives no order; quality can only hold the cell; an operator can give every order, but
-cannot resume after an alarm that only a process engineer clears; an engineer can give every order. The list has only a
-hash of each password. A change takes effect at once, also for an open page.
+cannot resume after an alarm that only a process engineer clears; an engineer can give every order. A program has a token
+in place of a password, and reads what a viewer sees. The list has only a hash of each password and of each token. A
+change takes effect at once, also for an open page.
 
-Example:
+Examples:
   regrind users add \"A. Smith\" --role operator
+  regrind users token prometheus
   regrind serve --listen 0.0.0.0:7373 --certificate cell.pem --key cell.key --users users.toml
 
 Exit codes: 0 done; 2 bad arguments, a password that is too short, or a list that cannot be read or written.")]
@@ -41,9 +43,17 @@ enum UsersCommand {
         #[command(flatten)]
         list: UserListFile,
     },
-    /// Remove a person from the list
+    /// Make a token with which a program reads the page, or replace the token of a program. The token is printed once
+    Token {
+        /// Name of the program
+        #[arg(value_name = "NAME")]
+        name: String,
+        #[command(flatten)]
+        list: UserListFile,
+    },
+    /// Remove a person, or the token of a program, from the list
     Remove {
-        /// Name of the person
+        /// Name of the person or of the program
         #[arg(value_name = "NAME")]
         name: String,
         #[command(flatten)]
@@ -69,17 +79,38 @@ struct UserListFile {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     match &arguments.what {
         UsersCommand::Add { name, role, list } => add(name, *role, &list.path)?,
+        UsersCommand::Token { name, list } => make_token(name, &list.path)?,
         UsersCommand::Remove { name, list } => remove(name, &list.path)?,
         UsersCommand::List { list, json } => print_users(&Users::read(&list.path)?, *json)?,
     }
     Ok(Outcome::Accepted)
 }
 
+/// Reads the list of users at `path`. Returns an empty list if there is no such file.
+fn read_or_new(path: &Path) -> Result<Users, Failure> {
+    match Users::read(path) {
+        Err(UsersError::Unreadable { source, .. }) if source.kind() == io::ErrorKind::NotFound => Ok(Users::default()),
+        read => Ok(read?),
+    }
+}
+
+/// Makes a token for the program `name` and prints it. Only the token goes to the standard output, so that it can be
+/// written to a file.
+fn make_token(name: &str, path: &Path) -> Result<(), Failure> {
+    let mut users = read_or_new(path)?;
+    let token = users.add_token(name)?;
+    write_private(path, users.to_text().as_bytes())?;
+    super::print(&format!("{token}\n"))?;
+    eprintln!(
+        "{} can now read the page with this token, which is shown only here; user list: {}",
+        name.trim(),
+        path.display()
+    );
+    Ok(())
+}
+
 fn add(name: &str, role: PageRole, path: &Path) -> Result<(), Failure> {
-    let mut users = match Users::read(path) {
-        Err(UsersError::Unreadable { source, .. }) if source.kind() == io::ErrorKind::NotFound => Users::default(),
-        read => read?,
-    };
+    let mut users = read_or_new(path)?;
     users.add(name, role, &password(name)?)?;
     write_private(path, users.to_text().as_bytes())?;
     super::print(&format!("{} can now sign in as {role}; user list: {}\n", name.trim(), path.display()))
@@ -91,15 +122,18 @@ fn remove(name: &str, path: &Path) -> Result<(), Failure> {
         return Err(Failure::NoUser { name: name.to_owned(), path: path.to_owned() });
     }
     write_private(path, users.to_text().as_bytes())?;
-    super::print(&format!("{name} can no longer sign in\n"))
+    super::print(&format!("{name} no longer has access\n"))
 }
 
 fn print_users(users: &Users, as_json: bool) -> Result<(), Failure> {
     if as_json {
-        let people: Vec<_> = users.people().map(|of| json!({ "name": of.name, "role": of.role })).collect();
-        return super::print_json(&people);
+        let people = users.people().map(|of| json!({ "name": of.name, "role": of.role, "kind": "person" }));
+        let programs =
+            users.programs().map(|name| json!({ "name": name, "role": PageRole::Viewer, "kind": "program" }));
+        return super::print_json(&people.chain(programs).collect::<Vec<_>>());
     }
-    users.people().try_for_each(|of| super::print(&format!("{:9}  {}\n", of.role, of.name)))
+    users.people().try_for_each(|of| super::print(&format!("{:9}  {}\n", of.role, of.name)))?;
+    users.programs().try_for_each(|name| super::print(&format!("{:9}  {name}\n", "program")))
 }
 
 /// Reads a password for the user `name` from the standard input and returns it. At a terminal, asks for the password

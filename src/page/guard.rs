@@ -9,6 +9,7 @@
 use std::collections::VecDeque;
 use std::io;
 use std::net::{IpAddr, SocketAddr};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -24,6 +25,9 @@ use axum::response::{IntoResponse, Response};
 use data_encoding::HEXLOWER;
 use sha2::{Digest, Sha256};
 
+use super::connections::Connections;
+use super::problem::{Problem, ProblemKind, is_for_programs};
+use super::program_tokens::WrongTokens;
 use super::rate::Rate;
 use super::sessions::SignedIn;
 use super::subject::PageSubject;
@@ -101,9 +105,13 @@ pub(crate) struct Guard {
     pub(crate) entrance: Entrance,
     pub(crate) subject: PageSubject,
     pub(crate) signed_in: SignedIn,
+    pub(crate) connections: Arc<Connections>,
+    pub(crate) wrong_tokens: WrongTokens,
     key: String,
     wrong: Mutex<Rate>,
     refusals: Mutex<Rate>,
+    /// Number of refused requests since the page began.
+    refusal_count: AtomicU64,
     /// Tokens without an order: the browser, the token and its time.
     tokens: Mutex<VecDeque<(String, String, Instant)>>,
     /// Browser that has control.
@@ -132,6 +140,9 @@ impl Guard {
             entrance,
             subject: of,
             signed_in: SignedIn::default(),
+            connections: Arc::default(),
+            wrong_tokens: WrongTokens::default(),
+            refusal_count: AtomicU64::new(0),
             key: random_word()?,
             wrong: Mutex::new(Rate::new()),
             refusals: Mutex::new(Rate::new()),
@@ -208,6 +219,27 @@ impl Guard {
         let told = self.cookie(request.headers(), KEY_COOKIE).map(|key| self.is_key(key));
         let session = id.filter(|_| told == Some(Some(true))).map(|id| Session { id, person: None, from });
         session.map(Admission::Admitted).ok_or_else(|| self.shut_out(request, told.unwrap_or(Some(false))))
+    }
+
+    /// Returns the session of the browser that sent `headers` from the address `from`, if it has access by its cookies.
+    /// Returns `None` if nobody has signed in there or, on a page without a list of users, if the key is missing or wrong.
+    pub(crate) fn session(&self, headers: &HeaderMap, from: IpAddr) -> Option<Session> {
+        let id = self.cookie(headers, SESSION_COOKIE)?.to_owned();
+        let person = match &self.entrance.users {
+            Some(users) => Some(self.signed_in.person(&id, users)?),
+            None => self.cookie(headers, KEY_COOKIE).filter(|key| self.is_own_key(key)).map(|_| None)?,
+        };
+        Some(Session { id, person, from })
+    }
+
+    /// Returns true if `key` is the key of the page. Counts no wrong keys.
+    pub(crate) fn is_own_key(&self, key: &str) -> bool {
+        same(key, &self.key)
+    }
+
+    /// Returns the number of refused requests since the page began, whether they were logged or not.
+    pub(crate) fn refusal_count(&self) -> u64 {
+        self.refusal_count.load(Ordering::Relaxed)
     }
 
     /// Responds to a browser that gave the correct key in the address. Sets a cookie with the key and a cookie with the
@@ -289,6 +321,7 @@ impl Guard {
     /// refused requests of each minute, and returns true for them. Returns false for the later ones, which are only
     /// counted. If the result is true, the caller should also record the refusal in the run.
     pub(crate) fn refused(&self, what: &str) -> bool {
+        self.refusal_count.fetch_add(1, Ordering::Relaxed);
         let (told, untold) = {
             let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
             let untold =
@@ -418,11 +451,7 @@ pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Re
         next.run(request).await
     } else {
         guard.record_refusal(&format!("a request for the host {}", printable(host)));
-        (
-            StatusCode::MISDIRECTED_REQUEST,
-            "this page has another address; open it with the address that the program printed at its start\n",
-        )
-            .into_response()
+        other_host(&guard, request.uri().path())
     };
     let headers = response.headers_mut();
     let policy = HeaderName::from_static("content-security-policy");
@@ -436,6 +465,16 @@ pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Re
         headers.insert(STRICT_TRANSPORT_SECURITY, HeaderValue::from_static("max-age=31536000"));
     }
     response
+}
+
+/// Returns the response to a request for `path` whose host is not this page.
+fn other_host(guard: &Guard, path: &str) -> Response {
+    const MESSAGE: &str =
+        "this page has another address; open it with the address that the program printed at its start";
+    match guard.subject == PageSubject::Cell && is_for_programs(path) {
+        true => Problem::new(ProblemKind::OtherHost, MESSAGE).into_response(),
+        false => (StatusCode::MISDIRECTED_REQUEST, format!("{MESSAGE}\n")).into_response(),
+    }
 }
 
 /// Answers with a new token for the next order of the browser.

@@ -1,8 +1,7 @@
 //! Access to a page: serves its routes to authorised clients, over TLS or on this computer, with limits on connections.
 
 use std::io;
-use std::net::IpAddr;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::extract::{DefaultBodyLimit, Request, State};
@@ -19,19 +18,14 @@ use hyper_util::service::TowerToHyperService;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpListener;
 use tokio::sync::oneshot;
-use tokio::task::AbortHandle;
 
 use super::compression::compression;
+use super::connections::Place;
 use super::guard::{self, Admission, Entrance, Guard, Peer};
-use super::sessions::place;
 use super::subject::PageSubject;
+use super::write_timeout::ImpatientWriter;
 use super::{assets, sign_in, view};
 
-/// Maximum number of simultaneous connections: of authorised clients, of clients that are not yet authorised, and of
-/// the latter from one address.
-const KNOWN: usize = 512;
-const STRANGERS: usize = 384;
-const STRANGERS_OF_ADDRESS: usize = 64;
 /// Timeout for a client to send its request, and timeout until the answer to an order begins. The second timeout
 /// includes the time for the body of the order and for the answer of the cell.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -63,16 +57,16 @@ impl GuardedServer {
 
     /// Serves `routes` to authorised clients that connect to `listener`, as long as the returned future is polled.
     pub async fn serve(self, listener: TcpListener, routes: Router) {
-        serve(listener, self.guard, routes).await;
+        serve(listener, self.guard, routes, Router::new()).await;
     }
 }
 
 /// Serves `routes` behind the access control of `guard` to clients that connect to `listener`, as long as the returned
-/// future is polled.
-pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Router) {
+/// future is polled. `for_programs` are routes with an access control of their own.
+pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Router, for_programs: Router) {
     let tls = guard.entrance.tls.clone();
-    let service = TowerToHyperService::new(guarded(guard, routes));
-    let connections = Arc::new(Connections::default());
+    let connections = Arc::clone(&guard.connections);
+    let service = TowerToHyperService::new(guarded(guard, routes, for_programs));
     for number in 0.. {
         let Ok((stream, peer)) = listener.accept().await else {
             // No file descriptor is free, or the client has gone. Both are temporary.
@@ -80,7 +74,7 @@ pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Rout
             continue;
         };
         let (service, tls) = (service.clone(), tls.clone());
-        let place = Place { connections: Arc::clone(&connections), number };
+        let place = Place::new(&connections, number);
         let (of, task) = (peer.ip(), Arc::clone(&connections));
         let is_known: Arc<dyn Fn() + Send + Sync> = Arc::new(move || task.know(number));
         let (is_listed, listed) = oneshot::channel::<()>();
@@ -100,80 +94,9 @@ pub(crate) async fn serve(listener: TcpListener, guard: Arc<Guard>, routes: Rout
                 }
             }
         });
-        connections.open().add(number, of, serving.abort_handle());
+        connections.add(number, of, serving.abort_handle());
         // The receiver may have ended with the program.
         let _ = is_listed.send(());
-    }
-}
-
-/// Connections of a page.
-///
-/// If the limit for clients that are not yet authorised is reached, a new connection ends the oldest of
-/// them: of the same address or network, or of the address that has most. A client that opens many idle connections
-/// therefore locks out no client elsewhere and no authorised client.
-#[derive(Default)]
-struct Connections(Mutex<Open>);
-
-#[derive(Default)]
-struct Open {
-    /// Connections of clients that are not yet authorised, in the order in which they came.
-    strangers: Vec<(u64, IpAddr, AbortHandle)>,
-    known: Vec<(u64, AbortHandle)>,
-}
-
-impl Connections {
-    fn open(&self) -> MutexGuard<'_, Open> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Marks the connection with the number `number` as a connection of an authorised client. If there are then too
-    /// many connections of authorised clients, ends the oldest of them. Does nothing if the connection is unknown or
-    /// already marked.
-    fn know(&self, number: u64) {
-        let mut open = self.open();
-        if let Some(at) = open.strangers.iter().position(|(of, ..)| *of == number) {
-            let (_, _, serving) = open.strangers.remove(at);
-            open.known.push((number, serving));
-            if open.known.len() > KNOWN {
-                open.known.remove(0).1.abort();
-            }
-        }
-    }
-
-    fn end(&self, number: u64) {
-        let mut open = self.open();
-        open.strangers.retain(|(of, ..)| *of != number);
-        open.known.retain(|(of, _)| *of != number);
-    }
-}
-
-impl Open {
-    fn add(&mut self, number: u64, from: IpAddr, serving: AbortHandle) {
-        self.strangers.push((number, place(from), serving));
-        let count = |from: IpAddr| self.strangers.iter().filter(|(_, of, _)| *of == from).count();
-        let most = match count(place(from)) > STRANGERS_OF_ADDRESS {
-            true => Some(place(from)),
-            false if self.strangers.len() > STRANGERS => {
-                self.strangers.iter().map(|(_, of, _)| *of).max_by_key(|of| count(*of))
-            }
-            false => None,
-        };
-        let oldest = most.and_then(|from| self.strangers.iter().position(|(_, of, _)| *of == from));
-        if let Some(oldest) = oldest {
-            self.strangers.remove(oldest).2.abort();
-        }
-    }
-}
-
-/// Connection in the list, until it ends.
-struct Place {
-    connections: Arc<Connections>,
-    number: u64,
-}
-
-impl Drop for Place {
-    fn drop(&mut self) {
-        self.connections.end(self.number);
     }
 }
 
@@ -190,12 +113,12 @@ async fn answer(
         request.extensions_mut().insert(peer.clone());
         service.call(request)
     });
-    drop(http.serve_connection(TokioIo::new(stream), service).await);
+    drop(http.serve_connection(TokioIo::new(ImpatientWriter::new(stream)), service).await);
 }
 
 /// Returns `routes` behind the access control of `guard`, together with the routes that everybody can use (sign-in and
-/// assets). Texts are compressed.
-fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
+/// assets) and with `for_programs`. Texts are compressed.
+fn guarded(guard: Arc<Guard>, routes: Router, for_programs: Router) -> Router {
     let own = Router::new()
         .route("/token", get(guard::token))
         .route("/sign-out", post(sign_in::sign_out))
@@ -205,6 +128,7 @@ fn guarded(guard: Arc<Guard>, routes: Router) -> Router {
         .layer(from_fn_with_state(Arc::clone(&guard), let_in))
         .route("/sign-in", post(sign_in::sign_in).with_state(Arc::clone(&guard)))
         .route("/assets/{name}", get(assets::asset))
+        .merge(for_programs)
         .layer(from_fn_with_state(guard, guard::names_this_page))
         .layer(compression())
         .layer(DefaultBodyLimit::max(LONGEST_BODY))

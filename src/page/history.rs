@@ -57,13 +57,24 @@ impl History {
 
     /// Lists the runs: active runs first, then from the newest to the oldest. Blocks while it reads the disk.
     pub(crate) fn list(&self) -> Vec<Listed> {
-        let listed = |id: String| {
-            let folder = self.folder(&id)?;
-            Some(Listed { is_live: is_live(&folder), summary: self.summary(&folder)?, id })
-        };
-        let mut all: Vec<Listed> = self.ids().filter_map(listed).collect();
+        let (mut all, _) = self.all();
         all.sort_by(|a, b| (b.is_live, &b.summary.began, &b.id).cmp(&(a.is_live, &a.summary.began, &a.id)));
         all
+    }
+
+    /// Returns all runs in no order, and the names of those whose record cannot be read in alphabetical order. Blocks while
+    /// it reads the disk.
+    pub(crate) fn all(&self) -> (Vec<Listed>, Vec<String>) {
+        let (mut listed, mut unreadable) = (Vec::new(), Vec::new());
+        for id in self.ids() {
+            let Some(folder) = self.folder(&id) else { continue };
+            match self.summary(&folder) {
+                Some(summary) => listed.push(Listed { is_live: is_live(&folder), summary, id }),
+                None => unreadable.push(id),
+            }
+        }
+        unreadable.sort();
+        (listed, unreadable)
     }
 
     /// Returns the summary of the run in `folder`. If the record of the run has not changed since the last call, takes

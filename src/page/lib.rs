@@ -4,6 +4,7 @@
 //! ```text
 //!  run folder: control.sock ==watch==> live ---> Seen --> view (HTML in user's language) --> stream --> every browser
 //!              journal.sqlite --------> history --^        shape (maps and points in bytes) ------------> the canvas
+//!  journal.sqlite, control.sock -> history, live -> api (JSON, events, metrics) ------------------------> other programs
 //!  browser ==POST==> guard (key or user, Host, Origin, token, control) --> orders ==control.sock==> the drive
 //! ```
 //!
@@ -11,11 +12,13 @@
 //! without effect on the run. The program contains everything that a browser needs; nothing is fetched from elsewhere.
 
 mod alarms;
+mod api;
 mod assets;
 mod attachment;
 mod chart;
 mod components;
 mod compression;
+mod connections;
 mod gauge;
 mod guard;
 mod guarded_server;
@@ -26,6 +29,9 @@ mod operator_step;
 mod orders;
 mod parts_view;
 mod pieces;
+mod problem;
+mod program_access;
+mod program_tokens;
 mod rate;
 mod reader;
 mod record_view;
@@ -42,6 +48,7 @@ mod users;
 mod view;
 mod viewers;
 mod workbench;
+mod write_timeout;
 
 use std::io;
 use std::path::PathBuf;
@@ -51,6 +58,7 @@ use axum::Router;
 use axum::extract::DefaultBodyLimit;
 use axum::routing::{get, post};
 use tokio::net::TcpListener;
+use tokio::sync::Semaphore;
 
 pub use gauge::gauge;
 pub use guard::{Entrance, Session};
@@ -67,7 +75,7 @@ pub use workbench::state::{RecipePrograms, Workbench};
 use guard::Guard;
 use history::History;
 use live::RunWatcher;
-use shared::Shared;
+use shared::{MAX_STREAMS, Shared};
 
 /// Maximum size of the file of a measurement that a browser sends.
 const MAX_MEASUREMENT_BYTES: usize = 64 << 20;
@@ -90,7 +98,8 @@ impl Page {
         let on_record = Box::new(move |what| drop(orders::write_down(&runs, None, what)));
         let guard = Arc::new(Guard::new(entrance, PageSubject::Cell, log, on_record)?);
         let viewers = Viewers::new();
-        Ok(Self { guard, run_watcher: live, history, plan, viewers, workbench: None, first_run: None })
+        let streams = Arc::new(Semaphore::new(MAX_STREAMS));
+        Ok(Self { guard, run_watcher: live, history, plan, viewers, workbench: None, streams, first_run: None })
     }
 
     /// Shows the run named `run` first, even if other runs are active.
@@ -116,7 +125,8 @@ impl Page {
     /// Serves the page to clients that connect to `listener`, as long as the returned future is polled.
     pub async fn serve(self, listener: TcpListener) {
         let guard = Arc::clone(&self.guard);
-        guarded_server::serve(listener, guard, routes(Arc::new(self))).await;
+        let page = Arc::new(self);
+        guarded_server::serve(listener, guard, routes(Arc::clone(&page)), api::routes(page)).await;
     }
 }
 

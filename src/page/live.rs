@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use regrind_cell::StateName;
 use regrind_control::{PreliminaryTouches, Request, Snapshot, send_request, watch};
@@ -34,6 +34,8 @@ pub(crate) struct ObservedRun {
     pub(crate) summary: Arc<RunSummary>,
     /// Preliminary touches of the measurement that runs; empty if none runs.
     pub(crate) touches: Arc<PreliminaryTouches>,
+    /// Time at which the last snapshot came; `None` if there was none.
+    pub(crate) snapshot_at: Option<Instant>,
 }
 
 impl ObservedRun {
@@ -152,7 +154,7 @@ async fn follow(folder: &Path, history: &Arc<History>, seen: &Sender<ObservedRun
         seen.send_if_modified(|now| {
             let changed =
                 now.snapshot != snapshot || !now.answers || told_by_people(&now.summary) != told_by_people(&summary);
-            *now = ObservedRun { snapshot, answers: true, summary, touches };
+            *now = ObservedRun { snapshot, answers: true, summary, touches, snapshot_at: Some(Instant::now()) };
             changed
         });
     }

@@ -18,6 +18,7 @@ use axum::http::StatusCode;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 use regrind_control::PreliminaryTouches;
+use regrind_formats::result::read_bytes;
 use regrind_formats::run_files::CycleFile;
 use regrind_formats::{DeviationRow, FormatError, MapNode, read_deviations, read_error_map};
 use regrind_report::CycleSummary;
@@ -66,8 +67,9 @@ fn f32_bytes<'v>(values: impl Iterator<Item = &'v f64>) -> Vec<u8> {
     values.flat_map(|value| (*value as f32).to_le_bytes()).collect()
 }
 
-/// Files of a cycle that a browser can save: the error map as a table, as pictures and as X3P, and the deviations.
-const SAVED: [CycleFile; 5] = [
+/// Files of a cycle that a browser or a program can save: the error map as a table, as pictures and as X3P, and the
+/// deviations.
+pub(crate) const SAVED: [CycleFile; 5] = [
     CycleFile::ErrorMap,
     CycleFile::ErrorMapPng,
     CycleFile::ErrorMapSvg,
@@ -86,18 +88,25 @@ pub(crate) async fn saved_file(
     };
     let title = format!("{run}-cycle-{cycle}-{name}");
     let read = spawn_blocking(move || {
-        // Results that were computed again are in a folder of their own, beside their map.
-        if wanted == CycleFile::Deviations {
-            return std::fs::read(file(&page, &run, cycle, |of| of.deviations.as_ref())?).ok();
-        }
-        let map = file(&page, &run, cycle, |of| of.map.as_ref())?;
-        std::fs::read(map.parent()?.join(wanted.name())).ok()
+        let folder = page.history.folder(&run)?;
+        let summary = page.history.summary(&folder)?;
+        let of = summary.cycles.iter().find(|of| of.cycle == cycle)?;
+        read_bytes(&saved_path(&folder, of, wanted)?).ok()
     });
     match read.await {
         Ok(Some(bytes)) => attachment(&title, bytes),
         Ok(None) => StatusCode::NOT_FOUND.into_response(),
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
+}
+
+/// Returns the path of a file of the cycle `of` in the run folder `folder`; `None` if nothing of it is on record.
+pub(crate) fn saved_path(folder: &std::path::Path, of: &CycleSummary, wanted: CycleFile) -> Option<PathBuf> {
+    // Results that were computed again are in a folder of their own, beside their map.
+    if wanted == CycleFile::Deviations {
+        return inside(folder, of.deviations.as_ref()?);
+    }
+    Some(inside(folder, of.map.as_ref()?)?.parent()?.join(wanted.name()))
 }
 
 /// Query of [`touched`].
@@ -134,7 +143,14 @@ fn file(page: &Shared, run: &str, cycle: u32, named: fn(&CycleSummary) -> Option
     let folder = page.history.folder(run)?;
     let summary = page.history.summary(&folder)?;
     let of = summary.cycles.iter().find(|of| of.cycle == cycle)?;
-    Some(folder.join(named(of)?))
+    inside(&folder, named(of)?)
+}
+
+/// Returns the path of the file `name` below the run folder `folder`. Returns `None` if the name leads out of the folder: a
+/// record that somebody has changed must not show other files of this computer.
+fn inside(folder: &std::path::Path, name: &str) -> Option<PathBuf> {
+    let mut parts = std::path::Path::new(name).components();
+    parts.all(|part| matches!(part, std::path::Component::Normal(_))).then(|| folder.join(name))
 }
 
 /// Responds with the bytes that `make` returns. Responds with the status 404 if `make` returns no bytes, and 422 if it
@@ -151,6 +167,46 @@ async fn respond(make: impl FnOnce() -> Option<Result<Option<Vec<u8>>, FormatErr
     }
 }
 
+/// Error map on a regular grid. A position without a measured node is NaN.
+pub(crate) struct RegularGrid {
+    /// Number of columns, along x, and of rows, along y.
+    pub(crate) columns: usize,
+    pub(crate) rows: usize,
+    /// First position along x and along y.
+    pub(crate) first_mm: [f64; 2],
+    /// Distance of two columns, and of two rows.
+    pub(crate) spacing_mm: [f64; 2],
+    /// Errors, row by row.
+    pub(crate) errors_um: Vec<f64>,
+    /// Standard uncertainties of the errors, in the same order.
+    pub(crate) sigmas_um: Vec<f64>,
+}
+
+/// Returns `nodes`, the measured nodes of an error map, on their regular grid. Returns `None` if the nodes do not lie on a
+/// regular grid, or if the grid has more than `max_nodes` positions.
+pub(crate) fn regular_grid(nodes: &[MapNode], max_nodes: usize) -> Option<RegularGrid> {
+    let [x, y] = [0, 1].map(|k| axis(nodes.iter().map(|node| node.at_mm[k]).collect()));
+    let ([first_x, step_x, columns], [first_y, step_y, rows]) = (x?, y?);
+    let (columns, rows) = (columns as usize, rows as usize);
+    if columns.checked_mul(rows)? > max_nodes {
+        return None;
+    }
+    let (mut errors_um, mut sigmas_um) = (vec![f64::NAN; columns * rows], vec![f64::NAN; columns * rows]);
+    for MapNode { at_mm: [x, y], error_mm, sigma_mm } in nodes {
+        let at = place(*y, first_y, step_y)? * columns + place(*x, first_x, step_x)?;
+        *errors_um.get_mut(at)? = 1e3 * error_mm;
+        *sigmas_um.get_mut(at)? = 1e3 * sigma_mm;
+    }
+    Some(RegularGrid {
+        columns,
+        rows,
+        first_mm: [first_x, first_y],
+        spacing_mm: [step_x, step_y],
+        errors_um,
+        sigmas_um,
+    })
+}
+
 /// Encodes `nodes`, the measured nodes of an error map, as bytes (little-endian). The nodes must lie on a regular grid.
 /// The bytes contain, in this order:
 ///
@@ -163,23 +219,11 @@ async fn respond(make: impl FnOnce() -> Option<Result<Option<Vec<u8>>, FormatErr
 /// A grid position without a measured node is NaN. Returns `None` if the nodes do not lie on a regular grid, or if the
 /// grid has more than `MAX_NODES` positions.
 fn grid_bytes(nodes: &[MapNode]) -> Option<Vec<u8>> {
-    let [x, y] = [0, 1].map(|k| axis(nodes.iter().map(|node| node.at_mm[k]).collect()));
-    let ([first_x, step_x, columns], [first_y, step_y, rows]) = (x?, y?);
-    let (columns, rows) = (columns as usize, rows as usize);
-    if columns.checked_mul(rows)? > MAX_NODES {
-        return None;
-    }
-    let mut values = vec![f32::NAN; 2 * columns * rows];
-    let (errors, sigmas) = values.split_at_mut(columns * rows);
-    for MapNode { at_mm: [x, y], error_mm, sigma_mm } in nodes {
-        let at = place(*y, first_y, step_y)? * columns + place(*x, first_x, step_x)?;
-        *errors.get_mut(at)? = (1e3 * error_mm) as f32;
-        *sigmas.get_mut(at)? = (1e3 * sigma_mm) as f32;
-    }
-    let mut bytes = Vec::with_capacity(40 + 4 * values.len());
+    let RegularGrid { columns, rows, first_mm, spacing_mm, errors_um, sigmas_um } = regular_grid(nodes, MAX_NODES)?;
+    let mut bytes = Vec::with_capacity(40 + 8 * errors_um.len());
     bytes.extend([columns as u32, rows as u32].iter().flat_map(|count| count.to_le_bytes()));
-    bytes.extend([first_x, first_y, step_x, step_y].iter().flat_map(|length| length.to_le_bytes()));
-    bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+    bytes.extend([first_mm, spacing_mm].iter().flatten().flat_map(|length| length.to_le_bytes()));
+    bytes.extend([errors_um, sigmas_um].iter().flatten().flat_map(|value| (*value as f32).to_le_bytes()));
     Some(bytes)
 }
 
@@ -216,6 +260,18 @@ fn point_bytes(rows: &[DeviationRow]) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn recorded_names_stay_in_run_folder() {
+        let of = |map: &str| {
+            let cycle = CycleSummary { map: Some(map.into()), ..CycleSummary::default() };
+            saved_path(std::path::Path::new("run"), &cycle, CycleFile::ErrorMapPng)
+        };
+        assert_eq!(of("cycle-1/error_map.csv"), Some("run/cycle-1/error_map.png".into()));
+        for outside in ["cycle-1/../../other/error_map.csv", "/etc/error_map.csv", "../error_map.csv"] {
+            assert_eq!(of(outside), None, "{outside}");
+        }
+    }
 
     #[test]
     fn touch_bytes_begin_at_asked_point() {

@@ -3,6 +3,8 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use tokio::sync::Semaphore;
+
 use super::guard::Guard;
 use super::history::History;
 use super::live::RunWatcher;
@@ -46,9 +48,14 @@ pub struct Page {
     pub(crate) viewers: Viewers,
     /// Workbench of the process engineer; `None` if the page has no folder of recipes.
     pub(crate) workbench: Option<Workbench>,
+    /// Permits for streams of events to programs.
+    pub(crate) streams: Arc<Semaphore>,
     /// Name of the run that the first page shows; None for the active run, or for the list if more than one is active.
     pub(crate) first_run: Option<String>,
 }
+
+/// Maximum number of streams of events to programs at a time.
+pub(crate) const MAX_STREAMS: usize = 32;
 
 /// State that all request handlers share.
 pub(crate) type Shared = Arc<Page>;

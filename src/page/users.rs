@@ -1,5 +1,5 @@
 //! Users who can sign in to the page, and their roles: a file with an entry for each person. It stores only an Argon2id
-//! hash of each password.
+//! hash of each password. Programs that read the page have a token each, of which the file stores only the SHA-256.
 
 use std::fmt::{self, Display, Formatter};
 use std::io;
@@ -10,16 +10,24 @@ use std::sync::{Mutex, PoisonError};
 use argon2::Argon2;
 use argon2::password_hash::phc::PasswordHash;
 use argon2::password_hash::{PasswordHasher, PasswordVerifier};
+use data_encoding::{BASE64URL_NOPAD, HEXLOWER};
 use regrind_document::misleading;
 use regrind_formats::{OpenToOthers, readable_by_others};
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 use thiserror::Error;
 
 /// First lines of the file, which explain it to a reader.
 const FIRST_LINES: &str = "\
 # People who can sign in to the page of this cell. `regrind users` writes this file. The file contains a hash of each password, not the password.
 # Keep the file secret: a person who has a hash can find a weak password by trying many passwords.
+# A `token` lets a program read the page (`regrind users token`). The file contains its hash, not the token.
 ";
+/// Beginning of each token, by which a person or a scanner of secrets recognises it, and number of its random bytes.
+const TOKEN_PREFIX: &str = "regrind_";
+const TOKEN_BYTES: usize = 32;
+/// Beginning of the hash of a token in the file.
+const TOKEN_PROOF: &str = "sha256:";
 /// Maximum length of the name of a person, in characters.
 const LONGEST_NAME: usize = 64;
 /// Minimum and maximum length of a password, in bytes. A shorter one is easy to guess; a longer one is rejected.
@@ -109,6 +117,12 @@ pub enum UsersError {
     Password { found: usize },
     #[error("the hash of the password cannot be computed: {0}")]
     Hash(String),
+    #[error(
+        "the name {name:?} belongs to a {of} in this list; choose another name, or first remove it: regrind users remove"
+    )]
+    Taken { name: String, of: &'static str },
+    #[error("the operating system has no random numbers for a token: {0}")]
+    NoRandom(String),
 }
 
 /// Content of the file.
@@ -117,6 +131,8 @@ pub enum UsersError {
 struct Written {
     #[serde(default)]
     user: Vec<User>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    token: Vec<ProgramToken>,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -128,10 +144,21 @@ struct User {
     proof: String,
 }
 
-/// List of the people who can sign in.
+/// Token of a program, which can read the page and give no orders.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ProgramToken {
+    name: String,
+    /// SHA-256 of the token in hexadecimal digits, after [`TOKEN_PROOF`]. The token has 256 random bits, so that nobody
+    /// finds it by trying; a slow hash as that of a password is not needed.
+    proof: String,
+}
+
+/// List of the people who can sign in, and of the programs that can read the page.
 #[derive(Clone, Debug, Default)]
 pub struct Users {
     users: Vec<User>,
+    tokens: Vec<ProgramToken>,
 }
 
 impl Users {
@@ -148,7 +175,7 @@ impl Users {
     }
 
     fn parse(text: &str) -> Result<Self, String> {
-        let Written { user: users } = toml::from_str(text).map_err(|error| error.to_string())?;
+        let Written { user: users, token: tokens } = toml::from_str(text).map_err(|error| error.to_string())?;
         for (at, user) in users.iter().enumerate() {
             let wrong = |what: &str| Err(format!("user {} ({:?}): {what}", at + 1, user.name));
             if named(&user.name).is_err() {
@@ -163,13 +190,31 @@ impl Users {
                 );
             }
         }
-        Ok(Self { users })
+        for (at, token) in tokens.iter().enumerate() {
+            let wrong = |what: &str| Err(format!("token {} ({:?}): {what}", at + 1, token.name));
+            if named(&token.name).is_err() {
+                return wrong("the name is not allowed");
+            }
+            if tokens[..at].iter().any(|other| other.name == token.name)
+                || users.iter().any(|user| user.name == token.name)
+            {
+                return wrong("another entry of the list has the same name; remove one of the two from the file");
+            }
+            let digits =
+                token.proof.strip_prefix(TOKEN_PROOF).and_then(|digits| HEXLOWER.decode(digits.as_bytes()).ok());
+            if digits.is_none_or(|bytes| bytes.len() != Sha256::output_size()) {
+                return wrong(
+                    "the `proof` of this token is not a hash of a token; remove this token from the file, then make a new one: regrind users token",
+                );
+            }
+        }
+        Ok(Self { users, tokens })
     }
 
     /// Returns the text of the file of users: TOML with a table `user` for each user, which holds name, role and hash
-    /// of the password. [`Users::read`] reads this text.
+    /// of the password, and a table `token` for each program. [`Users::read`] reads this text.
     pub fn to_text(&self) -> String {
-        let written = Written { user: self.users.clone() };
+        let written = Written { user: self.users.clone(), token: self.tokens.clone() };
         // The list contains only strings, so the conversion to TOML cannot fail.
         format!("{FIRST_LINES}\n{}", toml::to_string(&written).unwrap_or_default())
     }
@@ -177,9 +222,12 @@ impl Users {
     /// Adds a person with a role and a password, or replaces the role and the password of an existing person.
     ///
     /// # Errors
-    /// A name that is not allowed; a password that is too short or too long.
+    /// A name that is not allowed, or that a program has; a password that is too short or too long.
     pub fn add(&mut self, name: &str, role: PageRole, password: &str) -> Result<(), UsersError> {
         let name = named(name)?;
+        if self.tokens.iter().any(|token| token.name == name) {
+            return Err(UsersError::Taken { name, of: "program" });
+        }
         if !(SHORTEST_PASSWORD..=LONGEST_PASSWORD).contains(&password.len()) {
             return Err(UsersError::Password { found: password.len() });
         }
@@ -191,11 +239,36 @@ impl Users {
         Ok(())
     }
 
-    /// Removes the person with this name. Returns false if there was no such person.
+    /// Makes a token for the program `name`, which replaces an earlier token of this name. Returns the token. The list has
+    /// only its hash, so nobody can read the token there later.
+    ///
+    /// # Errors
+    /// A name that is not allowed, or that a person has; no random numbers.
+    pub fn add_token(&mut self, name: &str) -> Result<String, UsersError> {
+        let name = named(name)?;
+        if self.users.iter().any(|user| user.name == name) {
+            return Err(UsersError::Taken { name, of: "person" });
+        }
+        let mut bytes = [0; TOKEN_BYTES];
+        getrandom::fill(&mut bytes).map_err(|error| UsersError::NoRandom(error.to_string()))?;
+        let token = format!("{TOKEN_PREFIX}{}", BASE64URL_NOPAD.encode(&bytes));
+        self.tokens.retain(|token| token.name != name);
+        self.tokens.push(ProgramToken { name, proof: proof_of_token(&token) });
+        self.tokens.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(token)
+    }
+
+    /// Removes the person or the program with this name. Returns false if there was none.
     pub fn remove(&mut self, name: &str) -> bool {
-        let before = self.users.len();
+        let before = self.users.len() + self.tokens.len();
         self.users.retain(|user| user.name != name);
-        self.users.len() < before
+        self.tokens.retain(|token| token.name != name);
+        self.users.len() + self.tokens.len() < before
+    }
+
+    /// Returns the name of each program that has a token, in alphabetical order.
+    pub fn programs(&self) -> impl Iterator<Item = &str> + '_ {
+        self.tokens.iter().map(|token| token.name.as_str())
     }
 
     /// Returns the name and the role of each person on the list, in the order of the list. [`Self::add`] sorts the list
@@ -223,6 +296,11 @@ impl AuthenticatedUser {
     pub(crate) fn person(&self) -> Person {
         Person { name: self.0.name.clone(), role: self.0.role }
     }
+}
+
+/// Returns the hash of a token as it is in the file.
+fn proof_of_token(token: &str) -> String {
+    format!("{TOKEN_PROOF}{}", HEXLOWER.encode(&Sha256::digest(token)))
 }
 
 fn named(name: &str) -> Result<String, UsersError> {
@@ -286,6 +364,17 @@ impl UsersFile {
     /// second.
     pub(crate) fn signs_in(&self, name: &str, password: &str) -> Option<AuthenticatedUser> {
         self.now().signs_in(name, password)
+    }
+
+    /// Returns the entry of the token `token`; `None` if the list has no such token.
+    pub(crate) fn program(&self, token: &str) -> Option<ProgramToken> {
+        let proof = proof_of_token(token);
+        self.now().tokens.into_iter().find(|known| known.proof == proof)
+    }
+
+    /// Returns true if the current list contains this token with the same name.
+    pub(crate) fn has_program(&self, token: &ProgramToken) -> bool {
+        self.now().tokens.contains(token)
     }
 
     /// Returns true if the current list of users contains this user with the same name, role and password hash as at

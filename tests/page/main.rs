@@ -6,6 +6,8 @@
 
 regrind_testcell::program!();
 
+mod api;
+mod foreign_clients;
 mod in_a_browser;
 mod speed;
 mod strangers;
