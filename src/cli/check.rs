@@ -160,7 +160,7 @@ pub(super) fn cell_notes(cell: &CellConfig) -> Vec<String> {
 /// Returns true if a line of the file at `path` begins with one of the table headers in `heads`. The headers show the
 /// kind of a file, even if the rest of the file is invalid. Only the first MiB is read. Returns false if the file
 /// cannot be read.
-fn has_table(path: &Path, heads: &[&str]) -> bool {
+pub(super) fn has_table(path: &Path, heads: &[&str]) -> bool {
     const ENOUGH_BYTES: u64 = 1 << 20;
     let mut bytes = Vec::new();
     let read = File::open(path).and_then(|file| file.take(ENOUGH_BYTES).read_to_end(&mut bytes));

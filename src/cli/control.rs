@@ -107,6 +107,12 @@ enum ConfirmedState {
     Seen,
 }
 
+/// Returns the words for the facts that a person can confirm, with their help.
+pub(super) fn confirmed_words() -> impl Iterator<Item = (String, Option<String>)> {
+    let values = ConfirmedState::value_variants().iter().filter_map(ValueEnum::to_possible_value);
+    values.map(|value| (value.get_name().to_owned(), value.get_help().map(ToString::to_string)))
+}
+
 /// Reads the name of an alarm, such as `link_lost`.
 fn alarm_named(name: &str) -> Result<AlarmId, String> {
     let unknown = "no alarm has this name; `regrind status --json` has the active alarms with their names";

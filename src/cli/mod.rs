@@ -6,6 +6,7 @@ mod blocks;
 mod check;
 mod choice;
 mod compensate;
+mod complete;
 mod completeness;
 mod control;
 mod doctor;
@@ -130,6 +131,14 @@ pub fn main() -> ExitCode {
 }
 
 fn run() -> ExitCode {
+    match complete::answer(Arguments::command) {
+        Ok(false) => {}
+        Ok(true) => return ExitCode::SUCCESS,
+        Err(error) => {
+            let _ = error.print();
+            return ExitCode::from(FAULT);
+        }
+    }
     let arguments = match Arguments::try_parse() {
         Ok(arguments) => arguments,
         Err(error) => {
@@ -166,7 +175,7 @@ fn run() -> ExitCode {
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Schema(arguments) => schema::run(&arguments),
         Command::States(arguments) => states::run(&arguments),
-        Command::Completions(arguments) => shell::completions(&arguments, Arguments::command()),
+        Command::Completions(arguments) => shell::completions(&arguments),
         Command::Man(arguments) => shell::pages(&arguments, Arguments::command()),
     };
     match ended {

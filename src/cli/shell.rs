@@ -5,15 +5,21 @@ use std::path::PathBuf;
 
 use clap::{Args, Command};
 use clap_complete::Shell;
+use clap_complete::env::Shells;
 use clap_mangen::Man;
 use regrind::formats::{ResultFolder, write_atomic};
 
 use super::Outcome;
+use super::complete::VARIABLE;
 use super::failure::Failure;
 
 /// Print the script that completes the commands in a shell
 #[derive(Args, Debug)]
 #[command(after_help = "\
+The script completes commands and options, and also the names of runs (below --runs, or runs), recipes, cell files, and
+what the running cell asks to confirm. For these it starts regrind, which must be in the PATH, with the variable
+REGRIND_COMPLETE. Print the script again after an update of regrind.
+
 Examples:
   regrind completions bash > ~/.local/share/bash-completion/completions/regrind
   regrind completions zsh > ~/.zfunc/_regrind
@@ -40,10 +46,14 @@ pub(super) struct Pages {
     out: PathBuf,
 }
 
-/// Prints the completion script for the commands of `program`.
-pub(super) fn completions(arguments: &Completions, mut program: Command) -> Result<Outcome, Failure> {
+/// Prints the completion script, which starts this program for the candidates.
+pub(super) fn completions(arguments: &Completions) -> Result<Outcome, Failure> {
     let mut script = Vec::new();
-    clap_complete::generate(arguments.shell, &mut program, "regrind", &mut script);
+    let shells = Shells::builtins();
+    if let Some(shell) = shells.completer(&arguments.shell.to_string()) {
+        // Writing into memory cannot fail.
+        let _ = shell.write_registration(VARIABLE, "regrind", "regrind", "regrind", &mut script);
+    }
     super::print(&String::from_utf8_lossy(&script))?;
     Ok(Outcome::Accepted)
 }

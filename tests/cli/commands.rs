@@ -689,15 +689,15 @@ fn names_with_hidden_characters_refused() {
 fn completions_and_man_pages() {
     let bench = Bench::new();
     for (shell, words) in [
-        ("bash", "complete -F _regrind"),
+        ("bash", "-F _clap_complete_regrind regrind"),
         ("zsh", "#compdef regrind"),
-        ("fish", "complete -c regrind"),
+        ("fish", "--command regrind"),
         ("powershell", "Register-ArgumentCompleter"),
     ] {
         let output = bench.run(&["completions", shell]);
         let script = text(&output.stdout);
         assert_eq!(output.status.code(), Some(0));
-        assert!(script.contains(words) && script.contains("register"), "{shell}: {script}");
+        assert!(script.contains(words) && script.contains("REGRIND_COMPLETE"), "{shell}: {script}");
     }
     assert_eq!(bench.run(&["man", "--out", "man"]).status.code(), Some(0));
     for (page, words) in [

@@ -6,6 +6,8 @@ regrind_testcell::program!();
 #[cfg(unix)]
 mod book;
 mod commands;
+#[cfg(unix)]
+mod completions;
 mod designs;
 mod first_day;
 mod recipe;
