@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
-use regrind_live::{OpcUaSettings, SparkplugSettings};
+use regrind_live::{MtConnectSettings, OpcUaSettings, SparkplugSettings};
 use regrind_plant::{Approver, ArchiveSettings, ArtefactSettings, DatabaseSettings};
 use schemars::JsonSchema;
 use serde::Deserialize;
@@ -33,6 +33,8 @@ struct PlantFile {
     sparkplug: Option<SparkplugSettings>,
     /// Server that shows the status of the cell. Default: none.
     opcua: Option<OpcUaSettings>,
+    /// Adapter that shows the status of the cell to an agent of MTConnect. Default: none.
+    mtconnect: Option<MtConnectSettings>,
 }
 
 /// The plant, and this computer in it.
@@ -68,6 +70,8 @@ pub struct PlantConfig {
     pub sparkplug: Option<SparkplugSettings>,
     /// OPC UA server that shows the status of the cell.
     pub opcua: Option<OpcUaSettings>,
+    /// Adapter that shows the status of the cell to an agent of MTConnect.
+    pub mtconnect: Option<MtConnectSettings>,
     path: PathBuf,
     text: String,
     source_sha256: [u8; 32],
@@ -97,27 +101,31 @@ impl PlantConfig {
         document.check_schema(&SCHEMA);
         let written: Option<PlantFile> = document.deserialize();
         let at = path.parent().unwrap_or(Path::new(""));
-        let found = written.map(|PlantFile { plant, database, approver, artefacts, archive, sparkplug, opcua }| Self {
-            cell: plant.cell,
-            machines_differ: plant.machines_differ,
-            database: database.map(|database| DatabaseSettings {
-                password_file: resolve_path(at, database.password_file),
-                certificates: resolve_path(at, database.certificates),
-                ..database
-            }),
-            approvers: approver,
-            artefacts: artefacts.map(|kept| ArtefactSettings { folder: at.join(kept.folder), ..kept }),
-            archive: archive.map(|kept| ArchiveSettings { folder: at.join(kept.folder), ..kept }),
-            sparkplug: sparkplug.map(|broker| SparkplugSettings {
-                password_file: resolve_path(at, broker.password_file),
-                certificates: resolve_path(at, broker.certificates),
-                ..broker
-            }),
-            opcua,
-            path: path.to_owned(),
-            text: text.to_owned(),
-            source_sha256: sha256(text),
-        });
+        let found =
+            written.map(|PlantFile { plant, database, approver, artefacts, archive, sparkplug, opcua, mtconnect }| {
+                Self {
+                    cell: plant.cell,
+                    machines_differ: plant.machines_differ,
+                    database: database.map(|database| DatabaseSettings {
+                        password_file: resolve_path(at, database.password_file),
+                        certificates: resolve_path(at, database.certificates),
+                        ..database
+                    }),
+                    approvers: approver,
+                    artefacts: artefacts.map(|kept| ArtefactSettings { folder: at.join(kept.folder), ..kept }),
+                    archive: archive.map(|kept| ArchiveSettings { folder: at.join(kept.folder), ..kept }),
+                    sparkplug: sparkplug.map(|broker| SparkplugSettings {
+                        password_file: resolve_path(at, broker.password_file),
+                        certificates: resolve_path(at, broker.certificates),
+                        ..broker
+                    }),
+                    opcua,
+                    mtconnect,
+                    path: path.to_owned(),
+                    text: text.to_owned(),
+                    source_sha256: sha256(text),
+                }
+            });
         document.finish()?;
         found.ok_or_else(|| {
             Problems::whole(path, text, "a required value is missing".into(), "compare it with config/plant/plant.toml")

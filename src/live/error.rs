@@ -26,6 +26,11 @@ pub enum LiveError {
          through a tunnel: ssh -L 4840:127.0.0.1:4840 CELL"
     )]
     ForOthers { listen: SocketAddr },
+    #[error(
+        "{listen} is open to other computers, and the protocol of MTConnect adapters has no encryption; listen at 127.0.0.1, run the agent on \
+         this computer, or connect it through a tunnel: ssh -L 7878:127.0.0.1:7878 CELL"
+    )]
+    AgentsElsewhere { listen: SocketAddr },
     #[error("the OPC UA server cannot continue: {what}")]
     Server { what: String },
     #[error(transparent)]

@@ -54,3 +54,15 @@ pub struct OpcUaSettings {
     #[schemars(with = "String", example = &"127.0.0.1:4840")]
     pub listen: SocketAddr,
 }
+
+/// Adapter for an agent of MTConnect, which accepts no writes.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct MtConnectSettings {
+    /// Address, of this computer only, and port of the adapter (SHDR); port 0 selects a free port.
+    #[schemars(with = "String", example = &"127.0.0.1:7878")]
+    pub listen: SocketAddr,
+    /// Identity of the device in the devices file, unique among all devices. Default: `regrind-` and the name of the cell.
+    #[schemars(length(min = 1, max = 80), example = &"regrind-cell-1")]
+    pub uuid: Option<String>,
+}

@@ -11,6 +11,7 @@ mod broker;
 mod held;
 mod network;
 mod on_broker;
+mod on_mtconnect;
 mod on_opcua;
 mod on_postgres;
 mod peers;

@@ -19,14 +19,14 @@ impl PlantProcesses {
     /// the plant file.
     ///
     /// - If the plant file has a table `[database]`, the program `ship` replicates the records to the plant.
-    /// - If the plant file has a table `[sparkplug]` or `[opcua]`, the program `tell` publishes live values.
+    /// - If the plant file has a table `[sparkplug]`, `[opcua]` or `[mtconnect]`, the program `tell` publishes live values.
     ///
     /// The helper programs end shortly after the returned value is dropped. Returns an error if the plant file is
     /// invalid or a process cannot be started.
     pub(super) fn start(runs: &Path, plant: &Path) -> Result<Self, Failure> {
         // Errors of the file are reported here, before anything opens.
         let config = read(plant)?;
-        let tells = config.sparkplug.is_some() || config.opcua.is_some();
+        let tells = config.sparkplug.is_some() || config.opcua.is_some() || config.mtconnect.is_some();
         let wanted = [("ship", config.database.is_some()), ("tell", tells)];
         let begun = wanted.into_iter().filter(|(_, is_wanted)| *is_wanted).map(|(name, _)| {
             let mut command = Command::new(std::env::current_exe()?);

@@ -1,4 +1,4 @@
-//! `regrind tell`: publishes the status of this cell by Sparkplug B or OPC UA, in parallel with the work of the cell.
+//! `regrind tell`: publishes the status of this cell by Sparkplug B, OPC UA or MTConnect, in parallel with the work of the cell.
 
 mod follower;
 mod run_ends;
@@ -9,9 +9,11 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use regrind::config::PlantConfig;
 use regrind::drive::Request;
+use regrind::formats::write_atomic;
 use regrind_control::OnBehalf;
 use regrind_live::{
-    EventSender, LiveError, Node, PublisherEvent, PublisherLock, StatusReceiver, UaServer, event_queue, status_feed,
+    Adapter, EventSender, LiveError, Node, PublisherEvent, PublisherLock, StatusReceiver, UaServer, devices_file,
+    event_queue, status_feed,
 };
 use serde_json::json;
 use tokio::sync::mpsc;
@@ -35,19 +37,20 @@ const FAREWELL: Duration = Duration::from_secs(5);
 const ONE_BY_ONE: usize = 8;
 const MINUTE: Duration = Duration::from_secs(60);
 
-/// Publish live values of this cell to a broker (Sparkplug B) and to clients (OPC UA)
+/// Publish live values of this cell to a broker (Sparkplug B), to clients (OPC UA) and to agents (MTConnect)
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The tables [sparkplug] and [opcua] of the plant file name the receivers. The command runs until you stop it,
+The tables [sparkplug], [opcua] and [mtconnect] of the plant file name the receivers. The command runs until you stop it,
 also without an active run. The command accepts no orders: written values and received commands are refused, reported
 here, and recorded in the active run. Changes that cannot be published are kept, also after the end of this command,
 and are published later as historical values (Sparkplug B). `regrind run --plant` starts this command by itself.
 docs/live.md lists every value.
 
-Example:
+Examples:
   regrind tell --plant plant.toml --runs /srv/runs
+  regrind tell --plant plant.toml --devices Devices.xml     for the agent of MTConnect
 
-Exit codes: 0 stopped by Ctrl-C; 2 bad arguments, or an entry of the plant file cannot be used.")]
+Exit codes: 0 stopped by Ctrl-C, or the file is written; 2 bad arguments, or an entry of the plant file cannot be used.")]
 pub(in crate::cli) struct Arguments {
     /// Plant file: receivers of the values
     #[arg(long, value_name = "FILE")]
@@ -55,6 +58,9 @@ pub(in crate::cli) struct Arguments {
     /// Folder of the runs
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
+    /// Write the devices file for the agent of MTConnect, and publish nothing
+    #[arg(long, value_name = "FILE")]
+    devices: Option<PathBuf>,
     /// Print a line of JSON for each event
     #[arg(long)]
     json: bool,
@@ -66,6 +72,9 @@ pub(in crate::cli) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let config = read(&arguments.plant)?;
     let cell = cell_of(&config)?;
+    if let Some(path) = &arguments.devices {
+        return write_devices(&config, &cell, path);
+    }
     // Other programs of this computer have priority.
     outside::give_way(outside::BACKGROUND_STEPS);
     super::super::runtime()?.block_on(async {
@@ -88,13 +97,23 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
+/// Writes the devices file of an MTConnect agent for the cell named `cell` to `path`. If the plant file has no table
+/// `[mtconnect]`, prints this problem and returns a failure.
+fn write_devices(config: &PlantConfig, cell: &str, path: &Path) -> Result<Outcome, Failure> {
+    let missing =
+        || config.problem("mtconnect", "is missing", "", "add the table [mtconnect] with the address to listen at");
+    let settings = check::or_show(config.mtconnect.as_ref().ok_or_else(missing))?;
+    write_atomic(path, devices_file(settings, cell).as_bytes())?;
+    Ok(Outcome::Accepted)
+}
+
 /// Returns the name of the cell from the plant file, under which the live values are published. If the plant file has
-/// no table `[sparkplug]` or `[opcua]`, or no name of the cell, prints this problem and returns a failure.
+/// no table `[sparkplug]`, `[opcua]` or `[mtconnect]`, or no name of the cell, prints this problem and returns a failure.
 fn cell_of(config: &PlantConfig) -> Result<String, Failure> {
     let missing = |key, remedy| check::or_show(Err(config.problem(key, "is missing", "", remedy)));
     match &config.cell {
-        _ if config.sparkplug.is_none() && config.opcua.is_none() => {
-            missing("sparkplug", "name the receiver of the values in a table [sparkplug] or [opcua]")
+        _ if config.sparkplug.is_none() && config.opcua.is_none() && config.mtconnect.is_none() => {
+            missing("sparkplug", "name the receiver of the values in a table [sparkplug], [opcua] or [mtconnect]")
         }
         Some(cell) => Ok(cell.clone()),
         None => missing("plant.cell", "give the name of this cell"),
@@ -170,7 +189,7 @@ async fn publish(
     }
 }
 
-/// Starts one task for each publisher that the plant file names (Sparkplug, OPC UA), and returns these tasks. Each task
+/// Starts one task for each publisher that the plant file names (Sparkplug, OPC UA, MTConnect), and returns these tasks. Each task
 /// publishes every status that arrives in `told`. Each task sends its events (connected, not connected, request
 /// refused) to `notes`. `cell` is the published name, and `turn` the lock that keeps other programs from publishing the
 /// same cell. Returns an error if a publisher cannot be created.
@@ -187,6 +206,9 @@ fn begin(
     }
     if let Some(settings) = &config.opcua {
         telling.spawn(UaServer::new(settings, cell, turn, told.another(), notes.clone())?.run());
+    }
+    if let Some(settings) = &config.mtconnect {
+        telling.spawn(Adapter::new(settings, told.another(), notes.clone())?.run());
     }
     Ok(telling)
 }

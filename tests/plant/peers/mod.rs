@@ -15,16 +15,25 @@ fn scripts() -> PathBuf {
     root().join("tests/plant/peers")
 }
 
-/// Returns a Python with the packages that the peers need, installed once.
-fn python() -> &'static Path {
-    static PYTHON: OnceLock<Result<PathBuf, String>> = OnceLock::new();
-    PYTHON
+/// Returns a Python with the packages that a peer needs, installed once.
+fn python(script: &str) -> &'static Path {
+    static LIVE: OnceLock<Result<PathBuf, String>> = OnceLock::new();
+    static NOTIFY: OnceLock<Result<PathBuf, String>> = OnceLock::new();
+    let is_live = ["opcua_client.py", "sparkplug_host.py"].contains(&script);
+    let (python, import, requirements, home) = match is_live {
+        true => (&LIVE, "import asyncua, pysparkplug", "requirements.txt", "live-python"),
+        false => {
+            let import = "import pymtconnect";
+            (&NOTIFY, import, "notify-requirements.txt", "notify-python")
+        }
+    };
+    python
         .get_or_init(|| {
-            let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join("live-python");
-            with_packages("import asyncua, pysparkplug", &scripts().join("requirements.txt"), &home)
+            let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join(home);
+            with_packages(import, &scripts().join(requirements), &home)
         })
         .as_deref()
-        .unwrap_or_else(|why| panic!("no Python with asyncua and pysparkplug: {why}"))
+        .unwrap_or_else(|why| panic!("no Python for `{import}`: {why}"))
 }
 
 /// Python program that prints lines of JSON, and reads them.
@@ -35,7 +44,7 @@ pub struct Peer {
 
 impl Peer {
     pub fn start(script: &str, arguments: &[&str], folder: &Path) -> Self {
-        let mut command = Command::new(python());
+        let mut command = Command::new(python(script));
         command.arg(scripts().join(script)).args(arguments).current_dir(folder).stdin(Stdio::piped());
         let mut running = Running::new(command);
         let to = running.keys();
@@ -55,6 +64,12 @@ impl Peer {
     /// Waits until the messages from a position on satisfy a condition.
     pub fn until<T>(&mut self, from: usize, what: &str, is_so: impl Fn(&[Value]) -> Option<T>) -> T {
         self.running.until(what, |said| is_so(&parsed(&said[from.min(said.len())..])))
+    }
+
+    /// Waits until the peer listens, and returns its port.
+    pub fn port(&mut self) -> u16 {
+        let listens = |said: &[Value]| said.iter().find_map(|line| line["listens"].as_u64());
+        u16::try_from(self.until(0, "a port", listens)).unwrap()
     }
 
     /// Returns all messages of the peer.
