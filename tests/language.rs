@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 /// Folders of sources, with the number of banned types, banned functions and banned first words that each still has.
 /// Lower a number when it falls; never raise one.
-const ALLOWED: [(&str, [usize; 3]); 25] = [
+const ALLOWED: [(&str, [usize; 3]); 26] = [
     ("src/cell", [0, 0, 0]),
     ("src/cli", [0, 0, 0]),
     ("src/config", [0, 0, 0]),
@@ -23,6 +23,7 @@ const ALLOWED: [(&str, [usize; 3]); 25] = [
     ("src/journal", [0, 0, 0]),
     ("src/language", [0, 0, 0]),
     ("src/live", [0, 0, 0]),
+    ("src/notify", [0, 0, 0]),
     ("src/page", [0, 0, 0]),
     ("src/plant", [0, 0, 0]),
     ("src/python", [0, 0, 0]),

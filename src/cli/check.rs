@@ -17,13 +17,13 @@ use regrind::surface::PlaneProjection;
 use serde::Serialize;
 
 use super::failure::Failure;
-use super::{Outcome, nominal, truth};
+use super::{Outcome, nominal, plant, truth};
 
 /// Check recipes, cell files and dialects: every problem with line, column and remedy
 #[derive(Args, Debug)]
 #[command(after_help = "\
-A file with a table [cell] is a cell file. A file with a table [dialect] describes a dialect of machine programs. Any
-other file is a recipe. For a recipe, the command also checks the files that the recipe names and the table
+A file with a table [cell] is a cell file. A file with a table [dialect] describes a dialect of machine programs. A
+file with a table [plant] is a plant file. Any other file is a recipe. For a recipe, the command also checks the files that the recipe names and the table
 [simulation], which gives the true shape of the simulated part.
 
 Example:
@@ -128,12 +128,18 @@ pub(super) fn is_recipe(path: &Path) -> bool {
     has_table(path, &["[part]"])
 }
 
-/// Checks the file at `path`. Returns the kind of the file ("dialect", "cell file" or "recipe") and the result. The
+/// Checks the file at `path`. Returns the kind of the file ("dialect", "plant file", "cell file" or "recipe") and the result. The
 /// result is the SHA-256 hash of the file with notes for people, or all problems of the file.
 fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     if has_table(path, &["[dialect]"]) {
         let good = |file: DialectFile| Good { sha256: HEXLOWER.encode(&file.source_sha256), notes: file.renamed_keys };
         return ("dialect", read_dialect(path).map(good));
+    }
+    if has_table(path, &["[plant]"])
+        && let Some(checked) = plant::check_plant(path)
+    {
+        let good = |(sha256, notes): ([u8; 32], _)| Good { sha256: HEXLOWER.encode(&sha256), notes };
+        return ("plant file", checked.map(good));
     }
     if has_table(path, &["[cell]", "[cmm", "[[cmm", "[grinder]", "[grinder.", "[[grinder"]) {
         let good = |cell: CellConfig| Good { sha256: HEXLOWER.encode(cell.source_sha256()), notes: cell_notes(&cell) };

@@ -21,7 +21,7 @@ use serde::Serialize;
 use super::failure::Failure;
 use super::live::lock_machine;
 use super::run::within;
-use super::{Outcome, check, control, key};
+use super::{Outcome, check, control, key, plant};
 
 /// Check the computer, the cell file, the machines and a recipe for obstacles to a run; nothing moves
 #[derive(Args, Debug)]
@@ -47,6 +47,8 @@ pub(super) struct Arguments {
     /// Folder of the runs
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
+    #[command(flatten)]
+    plant: plant::DoctorArguments,
     /// Print the findings as JSON
     #[arg(long)]
     json: bool,
@@ -87,7 +89,7 @@ impl Finding {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let Arguments { cell: path, recipe, runs, json } = arguments;
+    let Arguments { cell: path, recipe, runs, plant, json } = arguments;
     if check::is_recipe(path) {
         return Err(Failure::RecipeForCell { path: path.clone() });
     }
@@ -98,7 +100,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     findings.extend([folder(runs), clock(runs), signing()]);
     findings.extend(open_runs(runs));
     findings.extend(recipe.as_ref().map(|recipe| Finding::from_result("recipe", fits(recipe, &cell))));
-    findings.extend(super::runtime()?.block_on(machines(&cell)));
+    let runtime = super::runtime()?;
+    findings.extend(runtime.block_on(machines(&cell)));
+    findings.extend(runtime.block_on(plant.try_receivers())?.into_iter().map(|(receiver, tried)| match tried {
+        Ok(words) => Finding::new(receiver, FindingLevel::Good, words),
+        // A run does not need it.
+        Err(words) => Finding::new(receiver, FindingLevel::Notice, words),
+    }));
     if *json {
         super::print_json(&findings)?;
     } else {

@@ -1,4 +1,4 @@
-//! `regrind schema`: the JSON schemas of recipes, cell files and dialects, for editors.
+//! `regrind schema`: the JSON schemas of recipes, cell files and dialects, for editors, and of notifications.
 
 use std::sync::LazyLock;
 
@@ -57,7 +57,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 
 /// Returns the parser of an argument that names a kind of file.
 fn of_kind() -> impl TypedValueParser<Value = FileKind> {
-    let kinds = || KINDS.into_iter().chain(plant::FILE_KIND);
+    let kinds = || KINDS.into_iter().chain(plant::FILE_KINDS.iter().copied());
     let words = kinds().map(|(name, help, _)| PossibleValue::new(name).help(help));
     PossibleValuesParser::new(words)
         .try_map(move |word| kinds().find(|(name, ..)| *name == word).ok_or("there is no such kind of file"))

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use regrind::config::CellConfig;
+use regrind::document::Problems;
 use regrind::drive::Task;
 use regrind::formats::Learned;
 use regrind::journal::PublicKey;
@@ -25,8 +26,24 @@ pub(super) fn run(command: &Commands) -> Result<Outcome, Failure> {
     match *command {}
 }
 
-/// Kind of file of a plant: none.
-pub(super) const FILE_KIND: Option<super::file_kind::FileKind> = None;
+/// Kinds of file of a plant: none.
+pub(super) const FILE_KINDS: &[super::file_kind::FileKind] = &[];
+
+/// Checks no plant file.
+pub(super) fn check_plant(_: &Path) -> Option<Result<([u8; 32], Vec<String>), Problems>> {
+    None
+}
+
+/// Arguments of `regrind doctor` about the plant: none.
+#[derive(Args, Debug)]
+pub(super) struct DoctorArguments {}
+
+impl DoctorArguments {
+    /// Tries no receiver.
+    pub(super) async fn try_receivers(&self) -> Result<Vec<(String, Result<String, String>)>, Failure> {
+        Ok(Vec::new())
+    }
+}
 
 /// Arguments of `regrind run` about the plant: none.
 #[derive(Args, Debug)]

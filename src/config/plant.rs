@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use regrind_live::{MtConnectSettings, OpcUaSettings, SparkplugSettings};
+use regrind_notify::{NotifySettings, SettingsProblem};
 use regrind_plant::{Approver, ArchiveSettings, ArtefactSettings, DatabaseSettings};
 use schemars::JsonSchema;
 use serde::Deserialize;
@@ -35,6 +36,8 @@ struct PlantFile {
     opcua: Option<OpcUaSettings>,
     /// Adapter that shows the status of the cell to an agent of MTConnect. Default: none.
     mtconnect: Option<MtConnectSettings>,
+    /// Receivers of notifications of holds, alarms and ends of runs. Default: none.
+    notify: Option<NotifySettings>,
 }
 
 /// The plant, and this computer in it.
@@ -72,6 +75,8 @@ pub struct PlantConfig {
     pub opcua: Option<OpcUaSettings>,
     /// Adapter that shows the status of the cell to an agent of MTConnect.
     pub mtconnect: Option<MtConnectSettings>,
+    /// Receivers of notifications. Their file paths are resolved.
+    pub notify: Option<NotifySettings>,
     path: PathBuf,
     text: String,
     source_sha256: [u8; 32],
@@ -100,32 +105,37 @@ impl PlantConfig {
         let mut document = Document::parse(path, text)?;
         document.check_schema(&SCHEMA);
         let written: Option<PlantFile> = document.deserialize();
+        let notify = written.as_ref().and_then(|written| written.notify.as_ref());
+        for SettingsProblem { key, found, allowed, remedy } in notify.map(NotifySettings::problems).unwrap_or_default()
+        {
+            document.report(&format!("notify.{key}"), found, allowed, remedy);
+        }
         let at = path.parent().unwrap_or(Path::new(""));
-        let found =
-            written.map(|PlantFile { plant, database, approver, artefacts, archive, sparkplug, opcua, mtconnect }| {
-                Self {
-                    cell: plant.cell,
-                    machines_differ: plant.machines_differ,
-                    database: database.map(|database| DatabaseSettings {
-                        password_file: resolve_path(at, database.password_file),
-                        certificates: resolve_path(at, database.certificates),
-                        ..database
-                    }),
-                    approvers: approver,
-                    artefacts: artefacts.map(|kept| ArtefactSettings { folder: at.join(kept.folder), ..kept }),
-                    archive: archive.map(|kept| ArchiveSettings { folder: at.join(kept.folder), ..kept }),
-                    sparkplug: sparkplug.map(|broker| SparkplugSettings {
-                        password_file: resolve_path(at, broker.password_file),
-                        certificates: resolve_path(at, broker.certificates),
-                        ..broker
-                    }),
-                    opcua,
-                    mtconnect,
-                    path: path.to_owned(),
-                    text: text.to_owned(),
-                    source_sha256: sha256(text),
-                }
-            });
+        let found = written.map(
+            |PlantFile { plant, database, approver, artefacts, archive, sparkplug, opcua, mtconnect, notify }| Self {
+                cell: plant.cell,
+                machines_differ: plant.machines_differ,
+                database: database.map(|database| DatabaseSettings {
+                    password_file: resolve_path(at, database.password_file),
+                    certificates: resolve_path(at, database.certificates),
+                    ..database
+                }),
+                approvers: approver,
+                artefacts: artefacts.map(|kept| ArtefactSettings { folder: at.join(kept.folder), ..kept }),
+                archive: archive.map(|kept| ArchiveSettings { folder: at.join(kept.folder), ..kept }),
+                sparkplug: sparkplug.map(|broker| SparkplugSettings {
+                    password_file: resolve_path(at, broker.password_file),
+                    certificates: resolve_path(at, broker.certificates),
+                    ..broker
+                }),
+                opcua,
+                mtconnect,
+                notify: notify.map(|notify| notify.resolved(at)),
+                path: path.to_owned(),
+                text: text.to_owned(),
+                source_sha256: sha256(text),
+            },
+        );
         document.finish()?;
         found.ok_or_else(|| {
             Problems::whole(path, text, "a required value is missing".into(), "compare it with config/plant/plant.toml")

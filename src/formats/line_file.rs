@@ -56,6 +56,14 @@ impl LineFile {
         Ok(())
     }
 
+    /// Waits until the disk has all lines.
+    ///
+    /// # Errors
+    /// A file that cannot be written, or is not open.
+    pub fn sync(&self) -> io::Result<()> {
+        self.file.as_ref().ok_or_else(|| io::Error::other("the file is not open"))?.sync_data()
+    }
+
     /// Writes the file with `lines` and nothing else. A reader finds the earlier lines or these, also after a loss of
     /// power.
     ///

@@ -213,6 +213,11 @@ impl RecordedPlan {
         serde_json::from_value(self.0.get("tolerance")?.clone()).ok()
     }
 
+    /// Returns the plan; `None` if it is not on record, or if it is that of a version with other parameters.
+    pub fn cell_plan(&self) -> Option<CellPlan> {
+        serde_json::from_value(self.0.clone()).ok()
+    }
+
     /// Returns true if no plan is on record.
     pub fn is_missing(&self) -> bool {
         self.0.is_null()

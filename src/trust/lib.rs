@@ -30,6 +30,10 @@ pub enum TrustError {
     Password { path: PathBuf, source: io::Error },
     #[error("{}: other users of this computer can read the password ({}); allow only the owner to read the password file: {}", .path.display(), .open.how, .open.remedy)]
     PasswordIsOpen { path: PathBuf, open: OpenToOthers },
+    #[error("{}: {name} cannot be read: {source}; enter the path of its file in the key `{key}`", .path.display())]
+    Secret { path: PathBuf, name: &'static str, key: &'static str, source: io::Error },
+    #[error("{}: other users of this computer can read {name} ({}); allow only the owner to read the file: {}", .path.display(), .open.how, .open.remedy)]
+    SecretIsOpen { path: PathBuf, name: &'static str, open: OpenToOthers },
     #[error("{}: no certificates in PEM format can be read from this file: {what}; the file must contain the certificates of the issuer of the server certificate in PEM format", .path.display())]
     Certificates { path: PathBuf, what: String },
     #[error(
@@ -110,17 +114,38 @@ fn certificate_remedy(reason: &CertificateError) -> &'static str {
 /// # Errors
 /// The file cannot be read, is longer than 4096 bytes, or can be read by other users.
 pub fn read_password(path: &Path) -> Result<String, TrustError> {
-    let unread = |source| TrustError::Password { path: path.to_owned(), source };
-    if let Some(open) = readable_by_others(path).map_err(unread)? {
-        return Err(TrustError::PasswordIsOpen { path: path.to_owned(), open });
+    match read_private(path) {
+        Ok(Ok(text)) => Ok(text),
+        Ok(Err(open)) => Err(TrustError::PasswordIsOpen { path: path.to_owned(), open }),
+        Err(source) => Err(TrustError::Password { path: path.to_owned(), source }),
+    }
+}
+
+/// Reads a secret other than a password from its file, without the line ending. `name` is the secret in messages, and
+/// `key` is the key of the settings that names the file.
+///
+/// # Errors
+/// The file cannot be read, is longer than 4096 bytes, or can be read by other users.
+pub fn read_secret(path: &Path, name: &'static str, key: &'static str) -> Result<String, TrustError> {
+    match read_private(path) {
+        Ok(Ok(text)) => Ok(text),
+        Ok(Err(open)) => Err(TrustError::SecretIsOpen { path: path.to_owned(), name, open }),
+        Err(source) => Err(TrustError::Secret { path: path.to_owned(), name, key, source }),
+    }
+}
+
+/// Reads a file that only its owner can read. Returns how others can read it, if they can.
+fn read_private(path: &Path) -> io::Result<Result<String, OpenToOthers>> {
+    if let Some(open) = readable_by_others(path)? {
+        return Ok(Err(open));
     }
     let mut text = String::new();
-    File::open(path).and_then(|file| file.take(MAX_BYTES + 1).read_to_string(&mut text)).map_err(unread)?;
+    File::open(path)?.take(MAX_BYTES + 1).read_to_string(&mut text)?;
     if text.len() as u64 > MAX_BYTES {
-        let reason = format!("it is longer than {MAX_BYTES} bytes, too long for a password");
-        return Err(unread(io::Error::new(io::ErrorKind::InvalidData, reason)));
+        let reason = format!("it is longer than {MAX_BYTES} bytes, too long for a secret");
+        return Err(io::Error::new(io::ErrorKind::InvalidData, reason));
     }
-    Ok(text.trim_end_matches(['\r', '\n']).to_owned())
+    Ok(Ok(text.trim_end_matches(['\r', '\n']).to_owned()))
 }
 
 fn certified(path: &Path) -> Result<ClientConfig, String> {

@@ -11,9 +11,11 @@ mod broker;
 mod held;
 mod network;
 mod on_broker;
+mod on_mail;
 mod on_mtconnect;
 mod on_opcua;
 mod on_postgres;
+mod on_webhook;
 mod peers;
 mod postgres;
 

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use regrind::journal::JournalError;
 use regrind_live::LiveError;
+use regrind_notify::NotifyError;
 use regrind_plant::PlantError;
 use thiserror::Error;
 
@@ -24,6 +25,8 @@ pub(in super::super) enum PlantFailure {
     Plant(Box<PlantError>),
     #[error(transparent)]
     Live(#[from] LiveError),
+    #[error(transparent)]
+    Notify(#[from] NotifyError),
 }
 
 impl From<PlantError> for PlantFailure {

@@ -4,12 +4,15 @@
 mod archive;
 mod audit;
 mod cell_monitor;
+mod check;
 mod confirmed_part;
+mod doctor;
 mod failure;
 mod fill;
 mod knowledge;
 mod manage;
 mod members;
+mod notify;
 mod plant_file;
 mod processes;
 mod publish;
@@ -31,6 +34,8 @@ use regrind_plant::PlantError;
 use super::Outcome;
 use super::failure::Failure;
 pub(super) use audit::AuditArguments;
+pub(super) use check::check_plant;
+pub(super) use doctor::DoctorArguments;
 pub(super) use failure::PlantFailure;
 pub(super) use run_arguments::{ResumeArguments, RunArguments, start_processes};
 
@@ -41,6 +46,7 @@ pub(super) enum Commands {
     Work(run_queue::Arguments),
     Study(studies::Arguments),
     Tell(publish::Arguments),
+    Notify(notify::Arguments),
     Plant(manage::Arguments),
 }
 
@@ -50,13 +56,22 @@ pub(super) fn run(command: &Commands) -> Result<Outcome, Failure> {
         Commands::Work(arguments) => run_queue::run(arguments),
         Commands::Study(arguments) => studies::run(arguments),
         Commands::Tell(arguments) => publish::run(arguments),
+        Commands::Notify(arguments) => notify::run(arguments),
         Commands::Plant(arguments) => manage::run(arguments),
     }
 }
 
-/// Kind of file of a plant: its name on the command line, its description, and its JSON schema.
-pub(super) const FILE_KIND: Option<super::file_kind::FileKind> =
-    Some(("plant", "Plant files", regrind::config::plant_schema));
+/// Kinds of file of a plant: the name of each on the command line, its description, and its JSON schema.
+pub(super) const FILE_KINDS: &[super::file_kind::FileKind] = &[
+    ("plant", "Plant files", regrind::config::plant_schema),
+    ("notification", "Notifications, the bodies of requests to webhooks", notification_schema),
+];
+
+fn notification_schema() -> &'static serde_json::Value {
+    static SCHEMA: std::sync::LazyLock<serde_json::Value> =
+        std::sync::LazyLock::new(regrind_notify::notification_schema);
+    &SCHEMA
+}
 
 impl From<PlantError> for Failure {
     fn from(error: PlantError) -> Self {

@@ -20,6 +20,7 @@ impl PlantProcesses {
     ///
     /// - If the plant file has a table `[database]`, the program `ship` replicates the records to the plant.
     /// - If the plant file has a table `[sparkplug]`, `[opcua]` or `[mtconnect]`, the program `tell` publishes live values.
+    /// - If the plant file has a table `[notify]`, the program `notify` notifies its receivers.
     ///
     /// The helper programs end shortly after the returned value is dropped. Returns an error if the plant file is
     /// invalid or a process cannot be started.
@@ -27,7 +28,7 @@ impl PlantProcesses {
         // Errors of the file are reported here, before anything opens.
         let config = read(plant)?;
         let tells = config.sparkplug.is_some() || config.opcua.is_some() || config.mtconnect.is_some();
-        let wanted = [("ship", config.database.is_some()), ("tell", tells)];
+        let wanted = [("ship", config.database.is_some()), ("tell", tells), ("notify", config.notify.is_some())];
         let begun = wanted.into_iter().filter(|(_, is_wanted)| *is_wanted).map(|(name, _)| {
             let mut command = Command::new(std::env::current_exe()?);
             command.args([name, "--while-stdin", "--plant"]).arg(plant).arg("--runs").arg(runs);

@@ -1,4 +1,4 @@
-//! Independent clients for live values, in Python. They run in an environment that is made once below the target
+//! Independent clients for live values and receivers of notifications, in Python. They run in an environment that is made once below the target
 //! folder, or with the Python that REGRIND_PYTHON names, which must have the required packages.
 
 use std::io::Write;
@@ -23,7 +23,7 @@ fn python(script: &str) -> &'static Path {
     let (python, import, requirements, home) = match is_live {
         true => (&LIVE, "import asyncua, pysparkplug", "requirements.txt", "live-python"),
         false => {
-            let import = "import pymtconnect";
+            let import = "import aiosmtpd, pymtconnect, standardwebhooks";
             (&NOTIFY, import, "notify-requirements.txt", "notify-python")
         }
     };
