@@ -17,6 +17,7 @@ use regrind::surface::PlaneProjection;
 use serde::Serialize;
 
 use super::failure::Failure;
+use super::file_kind::CheckedPlantFile;
 use super::{Outcome, nominal, plant, truth};
 
 /// Check recipes, cell files and dialects: every problem with line, column and remedy
@@ -138,7 +139,8 @@ fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     if has_table(path, &["[plant]"])
         && let Some(checked) = plant::check_plant(path)
     {
-        let good = |(sha256, notes): ([u8; 32], _)| Good { sha256: HEXLOWER.encode(&sha256), notes };
+        let good =
+            |CheckedPlantFile { sha256, notes }: CheckedPlantFile| Good { sha256: HEXLOWER.encode(&sha256), notes };
         return ("plant file", checked.map(good));
     }
     if has_table(path, &["[cell]", "[cmm", "[[cmm", "[grinder]", "[grinder.", "[[grinder"]) {

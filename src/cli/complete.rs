@@ -132,7 +132,12 @@ fn status() -> Option<Snapshot> {
     let run = folders(&runs_folder()).find(|folder| is_live(folder))?;
     let (to, answer) = mpsc::channel();
     // The thread ends with the program.
-    std::thread::spawn(move || drop(send_request(&run, &Request::Status).map(|reply| to.send(reply.status))));
+    std::thread::spawn(move || {
+        if let Ok(reply) = send_request(&run, &Request::Status) {
+            // Nobody waits any more if the answer came late.
+            let _ = to.send(reply.status);
+        }
+    });
     answer.recv_timeout(ANSWER_TIMEOUT).ok()
 }
 

@@ -30,7 +30,7 @@ pub(super) fn run(command: &Commands) -> Result<Outcome, Failure> {
 pub(super) const FILE_KINDS: &[super::file_kind::FileKind] = &[];
 
 /// Checks no plant file.
-pub(super) fn check_plant(_: &Path) -> Option<Result<([u8; 32], Vec<String>), Problems>> {
+pub(super) fn check_plant(_: &Path) -> Option<Result<super::file_kind::CheckedPlantFile, Problems>> {
     None
 }
 

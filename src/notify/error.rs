@@ -13,7 +13,7 @@ use thiserror::Error;
 #[non_exhaustive]
 pub enum NotifyError {
     #[error("notifications to {receiver}: {source}")]
-    Trust { receiver: String, source: TrustError },
+    Trust { receiver: String, source: Box<TrustError> },
     #[error("notifications to {receiver}: the address of the receiver {found}; {remedy}")]
     Address { receiver: String, found: &'static str, remedy: &'static str },
     #[error(
@@ -33,5 +33,12 @@ pub enum NotifyError {
     #[error("{}: the queue of notifications cannot be stored in this folder: {source}; check that the folder exists, and that you have the right to write in it", .path.display())]
     Folder { path: PathBuf, source: io::Error },
     #[error(transparent)]
-    File(#[from] FormatError),
+    File(Box<FormatError>),
+}
+
+impl From<FormatError> for NotifyError {
+    fn from(error: FormatError) -> Self {
+        // Boxed because it is large and rare.
+        Self::File(Box::new(error))
+    }
 }

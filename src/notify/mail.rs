@@ -42,7 +42,7 @@ impl Mail {
     /// and the connection would not be encrypted.
     pub(crate) fn new(settings: &MailSettings) -> Result<Self, NotifyError> {
         let MailSettings { name, server, encryption, .. } = settings;
-        let trust = |source| NotifyError::Trust { receiver: name.clone(), source };
+        let trust = |source| NotifyError::Trust { receiver: name.clone(), source: Box::new(source) };
         let address = |address: &String| {
             mailbox(address)
                 .ok_or_else(|| NotifyError::MailAddress { receiver: name.clone(), address: address.clone() })

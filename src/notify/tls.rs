@@ -39,7 +39,7 @@ impl Tls {
     pub(crate) fn new(receiver: &str, host: &str, certificates: Option<&Path>) -> Result<Self, NotifyError> {
         let config = match certificates {
             Some(_) => tls_config(host, certificates, "[notify]")
-                .map_err(|source| NotifyError::Trust { receiver: receiver.to_owned(), source })?,
+                .map_err(|source| NotifyError::Trust { receiver: receiver.to_owned(), source: Box::new(source) })?,
             None => None,
         };
         let config = config.map_or_else(|| of_system(receiver), Ok)?;

@@ -41,7 +41,8 @@ impl Webhook {
     pub(crate) fn new(settings: &WebhookSettings) -> Result<Self, NotifyError> {
         let receiver = || settings.name.clone();
         let read = |path, name, key| {
-            read_secret(path, name, key).map_err(|source| NotifyError::Trust { receiver: receiver(), source })
+            read_secret(path, name, key)
+                .map_err(|source| NotifyError::Trust { receiver: receiver(), source: Box::new(source) })
         };
         let url = match &settings.url_file {
             Some(path) => read(path, "the address of a receiver", "url_file")?,

@@ -5,9 +5,14 @@ use std::path::Path;
 use regrind::config::PlantConfig;
 use regrind::document::Problems;
 
+use super::super::file_kind::CheckedPlantFile;
+
 /// Checks the plant file at `path`. Returns its SHA-256 and notes for people, or all its problems.
-pub(in super::super) fn check_plant(path: &Path) -> Option<Result<([u8; 32], Vec<String>), Problems>> {
-    Some(PlantConfig::read(path).map(|config| (*config.source_sha256(), notes(&config))))
+pub(in super::super) fn check_plant(path: &Path) -> Option<Result<CheckedPlantFile, Problems>> {
+    Some(
+        PlantConfig::read(path)
+            .map(|config| CheckedPlantFile { sha256: *config.source_sha256(), notes: notes(&config) }),
+    )
 }
 
 /// Returns a note for each secret of a receiver that cannot be read on this computer. This is not an error, because the

@@ -26,7 +26,13 @@ pub(in super::super) enum PlantFailure {
     #[error(transparent)]
     Live(#[from] LiveError),
     #[error(transparent)]
-    Notify(#[from] NotifyError),
+    Notify(Box<NotifyError>),
+}
+
+impl From<NotifyError> for PlantFailure {
+    fn from(error: NotifyError) -> Self {
+        Self::Notify(Box::new(error))
+    }
 }
 
 impl From<PlantError> for PlantFailure {

@@ -62,7 +62,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     // All files of the receivers are read before anything opens.
     let receivers = Receiver::all(settings)?;
     // Other programs of this computer have priority.
-    outside::give_way();
+    outside::give_way(outside::BACKGROUND_STEPS);
     super::super::runtime()?.block_on(async {
         let mut endings = outside::Endings::new().map_err(Failure::Signals)?;
         let ended = async {

@@ -118,7 +118,7 @@ pub(super) const ITEMS: &[Item] = &[
     length("form_rms", |told| Some(number(1e-3 * told.snapshot()?.cycles.last()?.judged_um()[1]))),
     length("pv_limit", |told| limit(told.snapshot()?.tolerance?.pv_mm)),
     length("rms_limit", |told| limit(told.snapshot()?.tolerance?.rms_mm)),
-    event("message", Place::Path, "MESSAGE", |told| message(told)),
+    event("message", Place::Path, "MESSAGE", message),
 ];
 
 /// Returns a number without an exponent, to 0.001 nm or 0.000001 %.
