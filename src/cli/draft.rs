@@ -11,7 +11,7 @@
 //! ```
 
 use std::io::{self, Read};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use regrind::compensation::path::ToolPath;
@@ -19,7 +19,7 @@ use regrind::config::{BUILT_IN_CELL, CellConfig};
 use regrind::document::Problems;
 use regrind::drive::{Programs, Task};
 use regrind::formats::RecipeFolder;
-use regrind::recipe::Recipe;
+use regrind::recipe::{NominalSource, Recipe};
 use regrind::surface::Nominal;
 use serde::Serialize;
 
@@ -88,7 +88,31 @@ fn checked(arguments: &Arguments, text: &str) -> Result<Recipe, Problems> {
         let found = format!("the text is longer than {} bytes", RecipeFolder::MAX_BYTES);
         return Err(Problems::whole(&arguments.recipe, text, found, "keep points and maps in files of their own"));
     }
-    Recipe::parse(&arguments.recipe, text).and_then(with_good_files)
+    read_draft(&arguments.recipe, text).and_then(with_good_files)
+}
+
+/// Reads a recipe that a browser has sent as `text`. It can name only files below the folder of the recipe at `path`:
+/// the messages about a file quote it, and a person at a browser must not read other files of this computer.
+///
+/// # Errors
+/// Returns the problems of the text, and those of files elsewhere.
+pub(super) fn read_draft(path: &Path, text: &str) -> Result<Recipe, Problems> {
+    let recipe = Recipe::parse(path, text)?;
+    let folder = path.parent().and_then(|folder| folder.canonicalize().ok());
+    let is_elsewhere = |file: &&Path| match (file.canonicalize(), &folder) {
+        (Ok(file), Some(folder)) => !file.starts_with(folder),
+        // A file that does not exist is told later, without its content.
+        _ => false,
+    };
+    let of_nominal = matches!(&recipe.nominal, NominalSource::File { path, .. } if is_elsewhere(&path.as_path()));
+    let key = if of_nominal { "nominal.file" } else { "measure.file" };
+    match recipe.files().into_iter().find(is_elsewhere) {
+        None => Ok(recipe),
+        Some(file) => {
+            let found = format!("is {}, which is not below the folder of the recipes", file.display());
+            Err(recipe.problem(key, &found, "", "move the file to the recipes, or write this recipe with an editor"))
+        }
+    }
 }
 
 /// Shape of the part for a picture. Lengths are in millimetres, model frame.
@@ -231,10 +255,10 @@ mod tests {
 
     #[test]
     fn scattered_points_give_highest_of_each_node() {
-        let points = [[0.0, 0.0, 1.0], [10.0, 0.0, 2.0], [0.0, 10.0, 3.0], [10.0, 10.0, 4.0], [9.9, 9.9, 7.0]];
-        let points = points.into_iter().map(Point::from).collect();
+        let places = (0..9).map(|k| [5.0 * f64::from(k % 3), 5.0 * f64::from(k / 3)]);
+        let points = places.map(|[x, y]| Point::new(x, y, 0.1 * x + y)).chain([Point::new(9.5, 9.5, 20.0)]).collect();
         let heights = SampledHeights::of_points(&Nominal::from_points(points, PlaneProjection::Xy).unwrap());
         assert_eq!((heights.columns, heights.rows), (2, 2));
-        assert_eq!(heights.heights_mm, [1.0, 2.0, 3.0, 7.0].map(Some));
+        assert_eq!(heights.heights_mm, [0.0, 1.0, 10.0, 20.0].map(Some));
     }
 }

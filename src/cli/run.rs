@@ -19,6 +19,7 @@ use regrind::record::{MeasuringStrategy, PartStart, RecordedPlan, RunContent};
 use regrind::setup;
 
 use super::control::folders;
+use super::draft::read_draft;
 use super::failure::Failure;
 use super::live::{PreparedRun, RunContext, outcome};
 use super::succession::RunPlace;
@@ -142,7 +143,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 fn read_recipe(arguments: &Arguments) -> Result<Recipe, Problems> {
     match &arguments.draft {
         None => Recipe::read(&arguments.recipe),
-        Some(draft) => Recipe::parse(&arguments.recipe, &read_text(draft)?),
+        Some(draft) => read_draft(&arguments.recipe, &read_text(draft)?),
     }
 }
 

@@ -107,6 +107,27 @@ fn draft_tells_problems_plan_and_shape() {
     assert_eq!(small_text(home.path()), text, "a draft changes no file");
 }
 
+/// A problem of a file quotes the file, so a text from a browser names only files beside the recipe.
+#[test]
+fn draft_reads_no_file_elsewhere() {
+    let home = tempfile::tempdir().unwrap();
+    let (_page, url) = begin(home.path(), &[]);
+    std::fs::write(home.path().join("secret.csv"), "password-of-the-shop\n").unwrap();
+    std::os::unix::fs::symlink("../secret.csv", home.path().join("recipes/link.csv")).unwrap();
+    std::fs::write(home.path().join("recipes/own.csv"), "not-a-number\n").unwrap();
+    let visitor = Visitor::with_key(&url);
+    let begin = "[part]\nname = \"a\"\n[nominal]\nfile = ";
+    let rest = small_text(home.path());
+    let rest = &rest[rest.find("[measure]").unwrap()..];
+    let absolute = home.path().join("secret.csv").display().to_string();
+    for (file, is_read) in [("own.csv", true), ("../secret.csv", false), (&absolute[..], false), ("link.csv", false)] {
+        let told = draft(&visitor, "small.toml", &format!("{begin}\"{file}\"\n{rest}"));
+        let problems = told[0]["problems"].to_string();
+        assert!(problems.contains("nominal.file") && !problems.contains("password"), "{file}: {problems}");
+        assert_eq!(problems.contains("not-a-number"), is_read, "{file}: {problems}");
+    }
+}
+
 #[test]
 fn saved_text_is_file_and_version() {
     let home = tempfile::tempdir().unwrap();
@@ -297,7 +318,10 @@ fn recipe_is_written_from_nothing() {
     tab.read(&mut browser, "(() => { const { view } = window.regrindOpened.editor; view.dispatch({ selection: { anchor: view.state.doc.length } }); view.focus(); })()");
     tab.send(&mut browser, "Input.insertText", json!({ "text": "probe_r" }));
     tab.until(&mut browser, "document.querySelector('#editor').shadowRoot.querySelector('.cm-completionLabel')?.textContent === 'probe_radius_mm'");
-    tab.press(&mut browser, "Enter", 13, "\r");
+    // A key is taken only some time after the list has opened; the mouse is taken at once.
+    let choose = "document.querySelector('#editor').shadowRoot.querySelector('.cm-completionLabel')\
+                  .dispatchEvent(new MouseEvent('mousedown', { bubbles: true }))";
+    tab.read(&mut browser, choose);
     tab.until(&mut browser, "window.regrindOpened.text().includes('probe_radius_mm = ')");
     // A wrong key and a wrong unit stand below their lines before anything runs.
     tab.read(&mut browser, &editor_text(FROM_NOTHING));
