@@ -23,7 +23,7 @@ use regrind::recipe::{NominalSource, Recipe};
 use regrind::surface::Nominal;
 use serde::Serialize;
 
-use super::check::{ProblemDocument, or_show, with_good_files};
+use super::check::{ProblemDocument, with_good_files};
 use super::failure::Failure;
 use super::plan::{PlanDocument, PlannedRun};
 use super::run_plan::path_picture;
@@ -69,11 +69,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         }
     };
     super::print_json_line(&Line::Checked { problems: Vec::new(), notes: recipe.notes() })?;
-    let cell = or_show(CellConfig::read(&arguments.cell))?;
-    let PlannedRun { document, task, path } = match PlannedRun::new(&recipe, &cell) {
+    let planned = CellConfig::read(&arguments.cell)
+        .map_err(|problems| problems.to_string())
+        .and_then(|cell| PlannedRun::new(&recipe, &cell).map_err(|failure| failure.to_string()));
+    let PlannedRun { document, task, path } = match planned {
         Ok(planned) => planned,
-        Err(failure) => {
-            super::print_json_line(&Line::Refused { reason: failure.to_string() })?;
+        Err(reason) => {
+            super::print_json_line(&Line::Refused { reason })?;
             return Ok(Outcome::NotInTolerance);
         }
     };

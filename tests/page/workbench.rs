@@ -107,6 +107,18 @@ fn draft_tells_problems_plan_and_shape() {
     assert_eq!(small_text(home.path()), text, "a draft changes no file");
 }
 
+/// A cell file with a problem is told in place of the plan.
+#[test]
+fn draft_for_broken_cell_tells_reason() {
+    let home = tempfile::tempdir().unwrap();
+    std::fs::write(home.path().join("cell.toml"), "[cell]\nnonsense = 1\n").unwrap();
+    let (_page, url) = begin(home.path(), &["--cell", "cell.toml"]);
+    let told = draft(&Visitor::with_key(&url), "small.toml", &small_text(home.path()));
+    let kinds: Vec<&str> = told.iter().map(|line| line["kind"].as_str().unwrap()).collect();
+    assert_eq!(kinds, ["checked", "refused"]);
+    assert!(told[1]["reason"].as_str().unwrap().contains("nonsense"), "{told:?}");
+}
+
 /// A problem of a file quotes the file, so a text from a browser names only files beside the recipe.
 #[test]
 fn draft_reads_no_file_elsewhere() {

@@ -223,7 +223,13 @@ const regrindWorkbench = (() => {
       try {
         const answer = await fetch(`${path}/draft`, { method: "POST", body: sent, headers: { "Content-Type": "text/plain" }, signal });
         if (!answer.ok) throw new Error((await answer.json()).message);
-        await eachLine(answer, (line) => { if (!signal.aborted && editor.text() === sent) take(line); });
+        let last = "";
+        await eachLine(answer, (line) => {
+          last = line.kind;
+          if (!signal.aborted && editor.text() === sent) take(line);
+        });
+        // The program was ended at its limit of time or size: what is shown is not that of this text.
+        if (!signal.aborted && !(["shape", "refused"].includes(last) || problems.length)) showNoPlan(texts.noAnswer, true);
       } catch (error) {
         if (!signal.aborted) say(String(error.message || error), true);
       }
@@ -237,7 +243,10 @@ const regrindWorkbench = (() => {
         element("problem-count").textContent = problems.length ? `${texts.problems} ${problems.length}` : texts.noProblem;
         element("problem-count").classList.toggle("has-problems", problems.length > 0);
         if (problems.length) showNoPlan(texts.noPlan);
-        else setGood(true);
+        else {
+          setGood(true);
+          showNoPlan(texts.checks);
+        }
       } else if (line.kind === "refused") {
         showNoPlan(line.reason, true);
       } else if (line.kind === "planned") {

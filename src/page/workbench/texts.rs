@@ -9,7 +9,7 @@ regrind_language::texts! {
     Save Saved Simulate EndSimulation CompareWith PresentFile CloseComparison TakeText
     Editor EditorHelp NoProblem ProblemCount Checks DraftKept DiscardDraft
     Surface TargetsAndTracks Scallops Targets Tracks EveryNth WholeView SceneHelp NoPicture HeightsTimes
-    Plan NoPlan Measuring TouchCount AtLeastMinutes Pass TrackCount Minutes AllPasses AtMostCycles ScallopHeight OfLimit
+    Plan NoPlan NoAnswer Measuring TouchCount AtLeastMinutes Pass TrackCount Minutes AllPasses AtMostCycles ScallopHeight OfLimit
     WheelLoss Removed Budget Weak WeakRemedy Warning
     Simulation NotSimulated Seed Simulates SimulationFailed Accepted NotAccepted LastMap Report
 }

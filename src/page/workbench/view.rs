@@ -266,7 +266,7 @@ fn script_texts(language: Language) -> Value {
         "editor": say(WorkbenchText::EditorHelp), "noProblem": say(WorkbenchText::NoProblem), "problems": say(WorkbenchText::ProblemCount), "checks": say(WorkbenchText::Checks),
         "draftKept": say(WorkbenchText::DraftKept), "discardDraft": say(WorkbenchText::DiscardDraft),
         "targets": say(WorkbenchText::Targets), "tracks": say(WorkbenchText::Tracks), "everyNth": say(WorkbenchText::EveryNth), "heightsTimes": say(WorkbenchText::HeightsTimes),
-        "scallops": say(WorkbenchText::ScallopHeight), "noPlan": say(WorkbenchText::NoPlan),
+        "scallops": say(WorkbenchText::ScallopHeight), "noPlan": say(WorkbenchText::NoPlan), "noAnswer": say(WorkbenchText::NoAnswer),
         "measuring": say(WorkbenchText::Measuring), "touches": say(WorkbenchText::TouchCount), "atLeastMinutes": say(WorkbenchText::AtLeastMinutes),
         "pass": say(WorkbenchText::Pass), "trackCount": say(WorkbenchText::TrackCount), "minutes": say(WorkbenchText::Minutes),
         "allPasses": say(WorkbenchText::AllPasses), "atMostCycles": say(WorkbenchText::AtMostCycles), "ofLimit": say(WorkbenchText::OfLimit),
