@@ -56,6 +56,11 @@ impl Browser {
 
     /// Calls a method of the browser, or of a tab by its session. Returns the result.
     pub fn send(&mut self, session: Option<&str>, method: &str, params: Value) -> Value {
+        self.call(session, method, params).unwrap_or_else(|message| panic!("{method}: {message}"))
+    }
+
+    /// Calls a method of the browser, or of a tab by its session. Returns the result, or the answer that refuses it.
+    fn call(&mut self, session: Option<&str>, method: &str, params: Value) -> Result<Value, Value> {
         self.sent += 1;
         let id = self.sent;
         let mut message = json!({ "id": id, "method": method, "params": params });
@@ -66,8 +71,7 @@ impl Browser {
         loop {
             let message = self.from.recv_timeout(PATIENCE).unwrap_or_else(|_| panic!("no answer to {method}"));
             if message["id"] == id {
-                assert!(message["error"].is_null(), "{method}: {message}");
-                return message["result"].clone();
+                return if message["error"].is_null() { Ok(message["result"].clone()) } else { Err(message) };
             }
             self.events.push(message);
         }
@@ -110,17 +114,23 @@ impl Tab {
 
     /// Returns the value of an expression in the page; null if it is not available yet.
     pub fn read(&self, browser: &mut Browser, expression: &str) -> Value {
+        self.evaluate(browser, expression).unwrap_or_else(|message| panic!("{expression}: {message}"))
+    }
+
+    /// Returns the value of an expression in the page, or the answer that refuses it.
+    fn evaluate(&self, browser: &mut Browser, expression: &str) -> Result<Value, Value> {
         let params = json!({ "expression": expression, "awaitPromise": true, "returnByValue": true });
-        self.send(browser, "Runtime.evaluate", params)["result"]["value"].clone()
+        Ok(browser.call(Some(&self.session), "Runtime.evaluate", params)?["result"]["value"].clone())
     }
 
     /// Waits until an expression is true.
     pub fn until(&self, browser: &mut Browser, expression: &str) {
         let began = Instant::now();
-        while self.read(browser, &format!("Boolean({expression})")) != true {
+        // The browser refuses a question if the tab moves to another page before the answer. The next page answers.
+        while self.evaluate(browser, &format!("Boolean({expression})")) != Ok(Value::Bool(true)) {
             if began.elapsed() >= PATIENCE {
-                let shown = self.read(browser, "[location.href, document.readyState, document.body?.innerText]");
-                panic!("never: {expression}; shown is {shown}");
+                let shown = self.evaluate(browser, "[location.href, document.readyState, document.body?.innerText]");
+                panic!("never: {expression}; shown is {shown:?}");
             }
             std::thread::park_timeout(std::time::Duration::from_millis(20));
         }
@@ -135,7 +145,8 @@ impl Tab {
                 "document.readyState == 'complete' && document.querySelector('{selector}') && !document.querySelector('{selector}').disabled"
             ),
         );
-        self.read(browser, &format!("document.querySelector('{selector}').click()"));
+        // The click possibly moves the tab to another page before the answer: the browser then refuses the answer.
+        let _ = self.evaluate(browser, &format!("document.querySelector('{selector}').click()"));
     }
 
     /// Presses a key, given by its name, its code, and the text that it types.
