@@ -57,7 +57,7 @@ enum Line<'a> {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    outside::give_way(outside::LOWEST_STEPS);
+    outside::give_way_to_all();
     let mut text = String::new();
     // A longer text is a text with a problem, so one byte more than allowed is enough.
     io::stdin().take(RecipeFolder::MAX_BYTES + 1).read_to_string(&mut text).map_err(Failure::Terminal)?;

@@ -1,6 +1,7 @@
 //! `regrind run`: grinds, measures, registers, judges and compensates, until the part is accepted or the loop must
 //! stop.
 
+use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -22,6 +23,7 @@ use super::control::folders;
 use super::draft::read_draft;
 use super::failure::Failure;
 use super::live::{PreparedRun, RunContext, outcome};
+use super::outcome::FAULT;
 use super::succession::RunPlace;
 use super::{Outcome, check, key, outside, plan, plant, serve, simulated, truth};
 
@@ -86,7 +88,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         if !within(&cell) {
             return Err(Failure::DraftNeedsSimulation { cell: arguments.cell.clone() });
         }
-        outside::give_way(outside::LOWEST_STEPS);
+        outside::give_way_to_all();
+        end_with_input();
     }
     let of_cell: Vec<String> =
         cell.renamed_keys().iter().cloned().chain(cell.calibration_notes(&regrind::report::today())).collect();
@@ -137,6 +140,16 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         }
         outcome(&ending)
     })
+}
+
+/// Ends this program when its standard input ends. The page that started it holds the other end, so the simulation does
+/// not outlive a page that was killed.
+fn end_with_input() {
+    std::thread::spawn(|| {
+        // An input that cannot be read has no page behind it either.
+        let _ = io::copy(&mut io::stdin(), &mut io::sink());
+        std::process::exit(FAULT.into())
+    });
 }
 
 /// Reads the recipe of a run, or the text that is to be tried in its place.

@@ -4,13 +4,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use regrind::formats::RecipeFolder;
+use regrind::formats::{RecipeFolder, SimulationFolder};
 use regrind::recipe;
 use regrind_page::{RecipePrograms, Workbench};
 use serde_json::Value;
 
 use super::failure::Failure;
-use super::outside;
 
 /// Folder of the recipes if the command names none. It need not exist.
 const DEFAULT_FOLDER: &str = "recipes";
@@ -52,6 +51,7 @@ pub(super) fn workbench(folder: Option<&Path>, cell: &Path) -> Result<Option<Wor
             Some(path) => Err(Failure::NoRecipesFolder { path: path.to_owned() }),
         };
     }
+    SimulationFolder::delete_abandoned();
     let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let program = std::env::current_exe().map_err(|source: io::Error| Failure::Terminal(source))?;
     let programs = ChildPrograms { program, cell: cell.to_owned() };
@@ -62,8 +62,6 @@ impl ChildPrograms {
     fn command(&self, name: &str, recipe: &Path) -> Command {
         let mut command = Command::new(&self.program);
         command.arg(name).arg(recipe);
-        // Ctrl-C at the terminal of the page ends the page, and the page ends its children.
-        outside::set_apart(&mut command);
         command
     }
 }

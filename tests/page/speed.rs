@@ -2,12 +2,15 @@
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use regrind_testcell::browser::{Browser, Tab};
+use regrind_testcell::http::Visitor;
 
-use crate::CellPage;
-use crate::program::{replaced, small_recipe};
+use crate::program::{Running, changed, replaced, small_recipe};
+use crate::workbench::post;
+use crate::{CellPage, serve_with};
 
 /// Number of repetitions of each time.
 const TIMES: usize = 20;
@@ -25,6 +28,15 @@ fn processor_s(process: u32) -> f64 {
     let fields: Vec<&str> = text.rsplit(')').next().unwrap().split_whitespace().collect();
     // User and system time, in hundredths of a second.
     (fields[11].parse::<f64>().unwrap() + fields[12].parse::<f64>().unwrap()) / 100.0
+}
+
+/// Returns the processor time of all children of a process since their begin, in seconds, of ended ones too.
+fn processor_of_children_s(process: &Running) -> f64 {
+    let text = std::fs::read_to_string(format!("/proc/{}/stat", process.id())).unwrap();
+    let fields: Vec<&str> = text.rsplit(')').next().unwrap().split_whitespace().collect();
+    // User and system time of the children that have ended, in hundredths of a second.
+    let ended = (fields[13].parse::<f64>().unwrap() + fields[14].parse::<f64>().unwrap()) / 100.0;
+    ended + process.children().into_iter().map(processor_s).sum::<f64>()
 }
 
 /// Returns the median time in ms from a reload to the first paint of content.
@@ -49,15 +61,35 @@ fn redraw_ms(browser: &mut Browser, tab: &Tab, selector: &str) -> f64 {
     median((0..TIMES).map(|_| tab.read(browser, &click).as_f64().unwrap()).collect())
 }
 
+/// Returns the median time in ms from the click on HOLD of a run that grinds to HOLDING on the page.
+fn hold_ms(browser: &mut Browser, tab: &Tab) -> f64 {
+    let hold = "(async () => { const banner = document.querySelector('#banner'); const seen = new Promise((done) => \
+                new MutationObserver(() => banner.innerText.includes('HOLDING') && done()).observe(banner, { childList: true, \
+                subtree: true, characterData: true })); const began = performance.now(); \
+                document.querySelector('[data-order=hold]').click(); await seen; return performance.now() - began; })()";
+    let mut times = Vec::new();
+    for _ in 0..TIMES {
+        tab.until(browser, "!document.querySelector('[data-order=hold]').disabled");
+        times.push(tab.read(browser, hold).as_f64().unwrap());
+        tab.until(browser, "!document.querySelector('[data-order=resume]').disabled");
+        tab.click(browser, "[data-order=resume]");
+        tab.until(browser, "document.querySelector('#banner').innerText.includes('EXECUTE')");
+    }
+    median(times)
+}
+
+/// Returns the text of the small recipe with 28,476 points.
+fn many_points(text: &str) -> String {
+    replaced(&replaced(text, "columns = 16", "columns = 226"), "rows = 12", "rows = 126")
+}
+
 /// A whole part with 28,476 points, and its page.
 #[test]
 #[ignore = "measures, and needs a browser: Debian package chromium"]
 fn page_with_many_points_is_fast() {
     let home = tempfile::tempdir().unwrap();
     let recipe = small_recipe(home.path(), 1e6);
-    let text = std::fs::read_to_string(&recipe).unwrap();
-    let text = replaced(&text, "columns = 16", "columns = 226");
-    std::fs::write(&recipe, replaced(&text, "rows = 12", "rows = 126")).unwrap();
+    std::fs::write(&recipe, many_points(&std::fs::read_to_string(&recipe).unwrap())).unwrap();
     let mut shown = CellPage::start(home.path(), &recipe);
     // The map of the first cycle is enough, whatever the verdict on the part is.
     assert!(shown.run.end().0 <= 1);
@@ -101,22 +133,44 @@ fn many_viewers_cost_little() {
     drop(viewers);
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&shown.url, [1366, 768]);
-    let order = |order: &str, word: &str| {
-        format!(
-            "(async () => {{ const banner = document.querySelector('#banner'); const seen = new Promise((done) => \
-             new MutationObserver(() => banner.innerText.includes('{word}') && done()).observe(banner, {{ childList: true, \
-             subtree: true, characterData: true }})); const began = performance.now(); \
-             document.querySelector('[data-order={order}]').click(); await seen; return performance.now() - began; }})()"
-        )
-    };
-    let mut times = Vec::new();
-    for _ in 0..TIMES {
-        tab.until(&mut browser, "!document.querySelector('[data-order=hold]').disabled");
-        times.push(tab.read(&mut browser, &order("hold", "HOLDING")).as_f64().unwrap());
-        tab.until(&mut browser, "!document.querySelector('[data-order=resume]').disabled");
-        tab.click(&mut browser, "[data-order=resume]");
-        tab.until(&mut browser, "document.querySelector('#banner').innerText.includes('EXECUTE')");
-    }
-    println!("HOLD to HOLDING on the page {:.0} ms", median(times));
+    println!("HOLD to HOLDING on the page {:.0} ms", hold_ms(&mut browser, &tab));
+    shown.run.signal("KILL");
+}
+
+/// A run that grinds, and simulations of the workbench one after the other on the same computer: the time from the
+/// click on HOLD to its effect.
+#[test]
+#[ignore = "measures, and needs a browser: Debian package chromium"]
+fn hold_beside_a_simulation_is_fast() {
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = CellPage::begin(home.path(), 1.0);
+    shown.run.line("grinding", |line| line.contains("grinding"));
+    let recipes = home.path().join("recipes");
+    std::fs::create_dir(&recipes).unwrap();
+    // The shipped recipe, whose machines need no time, so that the simulation computes nearly all of its time.
+    let text =
+        changed("recipes/freeform-mirror.toml", &[("[simulation]\nseed = 1", "[simulation]\nseed = 1\nspeed = 1e6")]);
+    let (page, url) = serve_with(home.path(), &["--listen", "127.0.0.1:0", "--recipes", "recipes"]);
+    let mut browser = Browser::start(home.path());
+    let tab = browser.open(&url.replace("/?", &format!("/runs/{}?", shown.id)), [1366, 768]);
+    println!("HOLD to HOLDING on the page, nothing beside, {:.0} ms", hold_ms(&mut browser, &tab));
+    let visitor = Visitor::with_key(&url);
+    let (is_over, simulations) = (AtomicBool::new(false), AtomicUsize::new(0));
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !is_over.load(Ordering::Relaxed) {
+                let task = serde_json::json!({ "text": text, "seed": simulations.fetch_add(1, Ordering::Relaxed) });
+                assert_eq!(post(&visitor, "/recipes/small.toml/simulation", &task).0, 204);
+                assert_eq!(visitor.get("/recipes/small.toml/simulation/events").status, 200);
+            }
+        });
+        let began = (Instant::now(), processor_of_children_s(&page));
+        let median = hold_ms(&mut browser, &tab);
+        is_over.store(true, Ordering::Relaxed);
+        let share = (processor_of_children_s(&page) - began.1) / began.0.elapsed().as_secs_f64();
+        println!("HOLD to HOLDING on the page, beside a simulation, {median:.0} ms");
+        println!("{simulations:?} simulations, {:.0} % of a core", 100.0 * share);
+        post(&visitor, "/recipes/small.toml/simulation/end", &serde_json::json!(null));
+    });
     shown.run.signal("KILL");
 }

@@ -1,13 +1,14 @@
 //! The workbench: who may use it, what it finds in a text, what it saves, and what it simulates.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use regrind_testcell::browser::{Browser, Tab};
 use regrind_testcell::http::{Answer, Visitor};
 use regrind_testutils::sample::all;
 use serde_json::{Value, json};
 
-use crate::program::{Running, run, small_recipe};
+use crate::program::{PATIENCE, Running, regrind, run, run_folders, small_recipe};
 use crate::{serve_with, users};
 
 /// Begins a page with a folder of recipes, in which there is a small one.
@@ -45,7 +46,7 @@ fn unchunked(answer: &Answer) -> String {
     }
 }
 
-fn post(visitor: &Visitor, path: &str, body: &Value) -> (u16, Value) {
+pub(crate) fn post(visitor: &Visitor, path: &str, body: &Value) -> (u16, Value) {
     let (origin, token) = (visitor.origin(), visitor.token());
     let answer = visitor.post(path, &[("Origin", &origin), ("X-Regrind-Token", &token)], body.to_string().as_bytes());
     (answer.status, serde_json::from_slice(&answer.body).unwrap_or(Value::Null))
@@ -247,6 +248,48 @@ fn text_is_simulated_without_saving() {
     assert!(last["isOver"] == true && last["html"].as_str().unwrap().contains("pert"), "{last}");
     assert_eq!(post(&visitor, "/recipes/small.toml/simulation/end", &json!(null)).0, 204);
     assert_eq!(visitor.get("/recipes/small.toml/simulation/map").status, 404);
+}
+
+/// A page that is killed takes its simulation along, and the next one deletes the folder.
+#[test]
+fn killed_page_leaves_no_simulation() {
+    let home = tempfile::tempdir().unwrap();
+    let temporary = home.path().join("t");
+    for folder in ["t", "recipes", "runs"] {
+        std::fs::create_dir(home.path().join(folder)).unwrap();
+    }
+    let serve = || {
+        let mut command = regrind(&["serve", "--listen", "127.0.0.1:0", "--recipes", "recipes"], home.path());
+        command.env("TMPDIR", &temporary);
+        let mut page = Running::new(command);
+        let line = page.line("address of the page", |line| line.starts_with("page "));
+        (page, line.trim_start_matches("page").trim().to_owned())
+    };
+    let folders = || -> Vec<PathBuf> {
+        std::fs::read_dir(&temporary).unwrap().map(|entry| entry.unwrap().path()).filter(|path| path.is_dir()).collect()
+    };
+    let (mut page, url) = serve();
+    let visitor = Visitor::with_key(&url);
+    // At the speed of real machines it takes an hour.
+    let text = std::fs::read_to_string(small_recipe(home.path(), 1.0)).unwrap();
+    assert_eq!(post(&visitor, "/recipes/small.toml/simulation", &json!({ "text": text, "seed": 7 })).0, 204);
+    page.until("a run", |_| folders().iter().any(|folder| !run_folders(&folder.join("runs")).is_empty()).then_some(()));
+    let [simulation] = page.children()[..] else { panic!("one child") };
+    page.signal("KILL");
+    let killed = Instant::now();
+    while is_alive(simulation) {
+        assert!(killed.elapsed() < PATIENCE, "the simulation goes on");
+        std::thread::park_timeout(Duration::from_millis(20));
+    }
+    assert_eq!(folders().len(), 1);
+    let (_page, _) = serve();
+    assert_eq!(folders(), Vec::<PathBuf>::new());
+}
+
+/// Returns true if a process works, also if nobody has asked for its exit code yet.
+fn is_alive(process: u32) -> bool {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();
+    stat.rsplit(')').next().is_some_and(|rest| !rest.trim().is_empty() && !rest.trim().starts_with('Z'))
 }
 
 /// A cell file with a real machine is refused for a draft, so that a text from a browser moves nothing.

@@ -174,6 +174,13 @@ impl Running {
         self.child.id()
     }
 
+    /// Returns the numbers of the child processes that live, from `/proc`.
+    pub fn children(&self) -> Vec<u32> {
+        let tasks = std::fs::read_dir(format!("/proc/{}/task", self.child.id())).unwrap();
+        let children = tasks.map(|task| std::fs::read_to_string(task.unwrap().path().join("children")).unwrap());
+        children.flat_map(|of| of.split_whitespace().map(|id| id.parse().unwrap()).collect::<Vec<_>>()).collect()
+    }
+
     /// Waits for the end. Returns the exit code and the text of the error stream.
     pub fn end(&mut self) -> (i32, String) {
         let began = Instant::now();

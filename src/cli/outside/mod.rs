@@ -23,4 +23,5 @@ pub(super) struct Ending {
 #[cfg(feature = "plant")]
 pub(super) const BACKGROUND_STEPS: i32 = 10;
 /// Steps to the lowest priority of a program.
-pub(super) const LOWEST_STEPS: i32 = 19;
+#[cfg(unix)]
+const LOWEST_STEPS: i32 = 19;

@@ -8,7 +8,7 @@ use std::time::Duration;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-use super::Ending;
+use super::{Ending, LOWEST_STEPS};
 
 /// Events that end a program from outside: a closed terminal, a stopped service.
 pub(crate) struct Endings {
@@ -74,6 +74,18 @@ pub(crate) fn is_in_front() -> bool {
 pub(crate) fn give_way(steps: i32) {
     // Without the permission the program continues at its priority.
     let _ = rustix::process::nice(steps);
+}
+
+/// Lowers the scheduling priority of this process below all others, if the system permits it. A process that a person
+/// started in a shell stays in the session of the shell.
+pub(crate) fn give_way_to_all() {
+    // Linux shares the processor between sessions first, and regards priorities only within a session. A process that
+    // leads a process group cannot leave its session.
+    if rustix::process::setsid().is_ok() {
+        // A system without autogroups has no such file.
+        let _ = std::fs::write("/proc/self/autogroup", LOWEST_STEPS.to_string());
+    }
+    give_way(LOWEST_STEPS);
 }
 
 /// Puts a child program, before its start, into a process group of its own. Ctrl-C at the terminal of this program then

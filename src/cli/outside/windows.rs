@@ -76,6 +76,9 @@ pub(crate) fn is_in_front() -> bool {
 /// Does nothing. On Unix this function lowers the priority of the process; on Windows the system decides.
 pub(crate) fn give_way(_steps: i32) {}
 
+/// Does nothing, like [`give_way`].
+pub(crate) fn give_way_to_all() {}
+
 /// Sets the start options of a child program so that Ctrl-C at the terminal of this program does not end the child.
 pub(crate) fn set_apart(command: &mut Command) {
     std::os::windows::process::CommandExt::creation_flags(command, NEW_GROUP);

@@ -65,13 +65,15 @@ pub(super) fn started(
     seed: u64,
     folder: Arc<SimulationFolder>,
 ) -> std::io::Result<Simulation> {
-    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).kill_on_drop(true);
-    let child = command.spawn()?;
+    command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).kill_on_drop(true);
+    let mut child = command.spawn()?;
+    // The child ends when its input ends, also if this program is killed.
+    let input = child.stdin.take();
     let (end, ended) = tokio::sync::watch::channel(None);
     let kept = Arc::clone(&folder);
     let program = tokio::spawn(async move {
         wait_for_end(child, end).await;
-        drop(kept);
+        drop((input, kept));
     });
     let history = Arc::new(History::new(folder.runs()));
     let watcher = RunWatcher::new(Arc::clone(&history));
