@@ -1,14 +1,14 @@
 //! Times of the page, for `docs/figures.md`. They depend on the machine, so they are printed and not judged here.
 
 use std::io::{Read, Write};
-use std::net::TcpStream;
+use std::net::{TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use regrind_testcell::browser::{Browser, Tab};
 use regrind_testcell::http::Visitor;
 
-use crate::program::{Running, changed, replaced, small_recipe};
+use crate::program::{Running, changed, regrind, replaced, small_recipe};
 use crate::workbench::post;
 use crate::{CellPage, serve_with};
 
@@ -137,23 +137,39 @@ fn many_viewers_cost_little() {
     shown.run.signal("KILL");
 }
 
-/// A run that grinds, and simulations of the workbench one after the other on the same computer: the time from the
-/// click on HOLD to its effect.
+/// A run that grinds, and beside it on the same computer a webhook that never answers, then simulations of the
+/// workbench one after the other: the time from the click on HOLD to its effect.
 #[test]
-#[ignore = "measures, and needs a browser: Debian package chromium"]
-fn hold_beside_a_simulation_is_fast() {
+#[ignore = "measures, and needs a browser (Debian package chromium) and the feature plant"]
+fn hold_is_fast_beside_other_programs() {
     let home = tempfile::tempdir().unwrap();
     let mut shown = CellPage::begin(home.path(), 1.0);
     shown.run.line("grinding", |line| line.contains("grinding"));
     let recipes = home.path().join("recipes");
     std::fs::create_dir(&recipes).unwrap();
-    // The shipped recipe, whose machines need no time, so that the simulation computes nearly all of its time.
-    let text =
-        changed("recipes/freeform-mirror.toml", &[("[simulation]\nseed = 1", "[simulation]\nseed = 1\nspeed = 1e6")]);
     let (page, url) = serve_with(home.path(), &["--listen", "127.0.0.1:0", "--recipes", "recipes"]);
     let mut browser = Browser::start(home.path());
     let tab = browser.open(&url.replace("/?", &format!("/runs/{}?", shown.id)), [1366, 768]);
     println!("HOLD to HOLDING on the page, nothing beside, {:.0} ms", hold_ms(&mut browser, &tab));
+
+    let silent = TcpListener::bind("127.0.0.1:0").unwrap();
+    let webhook = format!(
+        "[plant]\ncell = \"cell-1\"\n\n[[notify.webhook]]\nname = \"chat\"\nurl = \"http://{}/\"\nevents = [\"started\", \"held\"]\n",
+        silent.local_addr().unwrap()
+    );
+    std::fs::write(home.path().join("plant.toml"), webhook).unwrap();
+    let mut notifier = Running::new(regrind(&["notify", "--plant", "plant.toml", "--json"], home.path()));
+    // It reads the first notification, and its connection stays open.
+    let (mut request, _) = silent.accept().unwrap();
+    request.read_exact(&mut [0; 4]).unwrap();
+    let median = hold_ms(&mut browser, &tab);
+    println!("HOLD to HOLDING on the page, beside a webhook that never answers, {median:.0} ms");
+    assert!(!notifier.is_over());
+    notifier.signal("KILL");
+
+    // The shipped recipe, whose machines need no time, so that the simulation computes nearly all of its time.
+    let speed = ("[simulation]\nseed = 1", "[simulation]\nseed = 1\nspeed = 1e6");
+    let text = changed("recipes/freeform-mirror.toml", &[speed]);
     let visitor = Visitor::with_key(&url);
     let (is_over, simulations) = (AtomicBool::new(false), AtomicUsize::new(0));
     std::thread::scope(|scope| {
