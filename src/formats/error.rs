@@ -26,6 +26,15 @@ pub enum FormatError {
     /// A recipe that another person or program has changed since it was read.
     #[error("{path}: the file was changed meanwhile; compare your text with the present one, then save again")]
     ChangedMeanwhile { path: PathBuf },
+    /// A file that is no recipe.
+    #[error("{path}: this is no recipe, because it has no table [part]; this page opens and saves recipes only")]
+    NoRecipe { path: PathBuf },
+    /// A link to a file that is not in the folder of the recipes.
+    #[error("{path}: this link leads out of the folder of the recipes, or nowhere; replace it by the file itself")]
+    RecipeElsewhere { path: PathBuf },
+    /// A recipe that another program saves or has locked.
+    #[error("{path}: another program has locked this recipe for more than 3 s; end that program, then save again")]
+    RecipeBusy { path: PathBuf },
     /// A saved version that differs from its description.
     #[error("{path}: this saved version was changed; take another version, or restore the file from a backup")]
     ChangedVersion { path: PathBuf },

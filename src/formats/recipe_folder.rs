@@ -6,11 +6,17 @@
 //!                                1.json who saved it, and when
 //! ```
 //!
-//! A text that another program has changed becomes a version of its own before it is replaced, so no text is lost.
+//! A text that another program has changed becomes a version of its own before it is replaced. A change in the moment of
+//! saving is noticed, and the file stays as that program wrote it. So no text is lost.
+//!
+//! Only recipes are read and written: files with a table `[part]`, in this folder. Other files beside them, such as cell
+//! files and lists of users, are refused, and so are links that lead out of the folder.
 
 use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use data_encoding::HEXLOWER;
 use serde::{Deserialize, Serialize};
@@ -18,12 +24,16 @@ use sha2::{Digest, Sha256};
 
 use super::error::FormatError;
 use super::folder::ResultFolder;
-use super::registration::write_atomic;
+use super::registration::Draft;
+use super::system;
 
 /// Folder of the versions, below the folder of the recipes.
 const VERSIONS: &str = ".versions";
 /// Maximum length of the name of a recipe, in bytes.
 const MAX_NAME_BYTES: usize = 100;
+/// Maximum time for which a save waits for another one of the same recipe.
+const MAX_LOCK_WAIT: Duration = Duration::from_secs(3);
+const BETWEEN_LOCKS: Duration = Duration::from_millis(20);
 /// Extension of a recipe.
 const EXTENSION: &str = ".toml";
 
@@ -42,11 +52,14 @@ pub struct RecipeVersion {
     pub saved_at: String,
     /// SHA-256 of its text, in hexadecimal digits.
     pub sha256: String,
+    /// True if its description cannot be read. Only its number is then known.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub damaged: bool,
 }
 
 impl RecipeFolder {
     /// Maximum size of a recipe, in bytes.
-    pub const MAX_BYTES: u64 = 1 << 20;
+    pub const MAX_BYTES: u64 = 256 << 10;
 
     /// Creates the value for the folder `path`. Does not read the disk.
     pub fn at(path: impl Into<PathBuf>) -> Self {
@@ -80,10 +93,7 @@ impl RecipeFolder {
     pub fn names(&self) -> Result<Vec<String>, FormatError> {
         let entries = fs::read_dir(&self.0).map_err(|source| unreadable(&self.0, source))?;
         let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
-        let is_recipe = |name: &String| {
-            let text = self.file(name).and_then(|path| read_text(&path).ok());
-            text.is_some_and(|text| text.lines().any(|line| line.trim_start().starts_with("[part]")))
-        };
+        let is_recipe = |name: &String| matches!(self.text(name), Ok(Some(_)));
         let mut names: Vec<String> = names.filter(is_recipe).collect();
         names.sort();
         Ok(names)
@@ -92,20 +102,35 @@ impl RecipeFolder {
     /// Returns the text of the recipe named `name`. Returns `None` if there is no such file.
     ///
     /// # Errors
-    /// The file cannot be read, is larger than [`Self::MAX_BYTES`], or is not text.
+    /// The file cannot be read, is larger than [`Self::MAX_BYTES`], is not text, is no recipe, or lies elsewhere.
     pub fn text(&self, name: &str) -> Result<Option<String>, FormatError> {
-        let Some(path) = self.file(name) else { return Ok(None) };
+        let Some(path) = self.place(name)? else { return Ok(None) };
         match read_text(&path) {
-            Ok(text) => Ok(Some(text)),
+            Ok(text) if has_part(&text) => Ok(Some(text)),
+            Ok(_) => Err(FormatError::NoRecipe { path }),
             Err(FormatError::Unreadable { source, .. }) if source.kind() == io::ErrorKind::NotFound => Ok(None),
             Err(error) => Err(error),
+        }
+    }
+
+    /// Returns the place of the recipe named `name`, with all links followed. Returns `None` if the name is not plain.
+    ///
+    /// # Errors
+    /// A link that leads out of the folder, or nowhere.
+    fn place(&self, name: &str) -> Result<Option<PathBuf>, FormatError> {
+        let Some(path) = self.file(name) else { return Ok(None) };
+        let folder = self.0.canonicalize().map_err(|source| unreadable(&self.0, source))?;
+        match path.canonicalize() {
+            Ok(place) if place.starts_with(&folder) && !place.starts_with(folder.join(VERSIONS)) => Ok(Some(place)),
+            Err(_) if path.symlink_metadata().is_err() => Ok(Some(path)),
+            _ => Err(FormatError::RecipeElsewhere { path }),
         }
     }
 
     /// Returns the saved versions of the recipe named `name`, the first one first. The list is empty if none was saved.
     ///
     /// # Errors
-    /// The folder of the versions cannot be read, or the description of a version is damaged.
+    /// The folder of the versions cannot be read.
     pub fn versions(&self, name: &str) -> Result<Vec<RecipeVersion>, FormatError> {
         let Some(folder) = self.folder_of_versions(name) else { return Ok(Vec::new()) };
         let entries = match fs::read_dir(&folder) {
@@ -116,7 +141,8 @@ impl RecipeFolder {
         let number = |entry: fs::DirEntry| entry.file_name().to_str()?.strip_suffix(".json")?.parse::<u32>().ok();
         let mut numbers: Vec<u32> = entries.filter_map(|entry| number(entry.ok()?)).collect();
         numbers.sort_unstable();
-        numbers.into_iter().map(|number| read_version(&folder, number)).collect()
+        let read = |number| read_version(&folder, number).unwrap_or_else(|_| RecipeVersion::damaged(number));
+        Ok(numbers.into_iter().map(read).collect())
     }
 
     /// Returns the text of the saved version `number` of the recipe named `name`. Returns `None` if there is no such
@@ -141,9 +167,12 @@ impl RecipeFolder {
     /// it must be the present one, or `None` for a new recipe. `saved_by` is the person, and `saved_at` the time in UTC.
     /// If the text is already that of the file and of the newest version, saves nothing and returns that version.
     ///
+    /// An existing file keeps its owner and its permissions.
+    ///
     /// # Errors
-    /// A name that is not plain; a text that is too long; a file that was changed meanwhile; a file that cannot be read
-    /// or written.
+    /// A name that is not plain; a text that is too long or no recipe; a file that was changed meanwhile, that is no
+    /// recipe or lies elsewhere; a program that saves the same recipe for a long time; a file that cannot be read or
+    /// written.
     pub fn save(
         &self,
         name: &str,
@@ -151,33 +180,52 @@ impl RecipeFolder {
         replaces: Option<&str>,
         [saved_by, saved_at]: [&str; 2],
     ) -> Result<RecipeVersion, FormatError> {
-        let (Some(path), Some(folder)) = (self.file(name), self.folder_of_versions(name)) else {
+        let (Some(path), Some(folder)) = (self.place(name)?, self.folder_of_versions(name)) else {
             return Err(FormatError::RecipeName { name: name.to_owned() });
         };
         let found = text.len() as u64;
         if found > Self::MAX_BYTES {
             return Err(FormatError::TooLarge { path, found, limit: Self::MAX_BYTES, unit: "bytes" });
         }
+        if !has_part(text) {
+            return Err(FormatError::NoRecipe { path });
+        }
         ResultFolder::prepare(&folder)?.keep();
         let _lock = SavingLock::acquire(&folder)?;
+        delete_unfinished(&folder, ".");
+        delete_unfinished(&self.0, &format!(".{name}."));
         let present = self.text(name)?;
-        if present.as_deref() != replaces {
-            return Err(FormatError::ChangedMeanwhile { path });
-        }
+        let is_saved = |last: &RecipeVersion, text: &str| !last.damaged && last.sha256 == sha256(text);
         let mut versions = self.versions(name)?;
-        if let Some(present) = &present
-            && versions.last().is_none_or(|last| last.sha256 != sha256(present))
-        {
-            versions.push(write_version(&folder, next(&versions), present, [""; 2])?);
-        }
-        if let Some(last) = versions.last()
+        if let Some(last) = versions.last().filter(|last| is_saved(last, text))
             && present.as_deref() == Some(text)
         {
             return Ok(last.clone());
         }
-        let saved = write_version(&folder, next(&versions), text, [saved_by, saved_at])?;
-        write_atomic(&path, text.as_bytes())?;
-        Ok(saved)
+        if present.as_deref() != replaces {
+            return Err(FormatError::ChangedMeanwhile { path });
+        }
+        if let Some(present) = &present
+            && versions.last().is_none_or(|last| !is_saved(last, present))
+        {
+            let of_other = NewVersion::write(&folder, next(&versions), present, &path)?;
+            versions.push(of_other.describe(["", ""])?);
+            if present == text {
+                return Ok(versions.swap_remove(versions.len() - 1));
+            }
+        }
+        let version = NewVersion::write(&folder, next(&versions), text, &path)?;
+        match replace(&path, text, present.as_deref()) {
+            Ok(true) => version.describe([saved_by, saved_at]),
+            Ok(false) => {
+                version.withdraw();
+                Err(FormatError::ChangedMeanwhile { path })
+            }
+            Err(error) => {
+                version.withdraw();
+                Err(error)
+            }
+        }
     }
 
     fn folder_of_versions(&self, name: &str) -> Option<PathBuf> {
@@ -196,9 +244,21 @@ impl SavingLock {
     fn acquire(folder: &Path) -> Result<Self, FormatError> {
         let path = folder.join("lock");
         let failed = |source| FormatError::Unwritable { path: path.clone(), action: "locking it", source };
-        let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(failed)?;
-        file.lock().map_err(failed)?;
-        Ok(Self(file))
+        let file = match system::create_owners(&path) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                File::options().write(true).open(&path).map_err(failed)?
+            }
+            created => created.map_err(failed)?,
+        };
+        let until = Instant::now() + MAX_LOCK_WAIT;
+        loop {
+            match file.try_lock() {
+                Ok(()) => return Ok(Self(file)),
+                Err(fs::TryLockError::WouldBlock) if Instant::now() < until => thread::sleep(BETWEEN_LOCKS),
+                Err(fs::TryLockError::WouldBlock) => return Err(FormatError::RecipeBusy { path: path.clone() }),
+                Err(fs::TryLockError::Error(error)) => return Err(failed(error)),
+            }
+        }
     }
 }
 
@@ -209,24 +269,88 @@ impl Drop for SavingLock {
     }
 }
 
-/// Writes a version: its text first, so that a description never stands alone.
-fn write_version(
-    folder: &Path,
+/// Version whose text is on the disk. Without a description it does not count.
+struct NewVersion<'f> {
+    folder: &'f Path,
     number: u32,
-    text: &str,
-    [saved_by, saved_at]: [&str; 2],
-) -> Result<RecipeVersion, FormatError> {
-    let version = RecipeVersion {
-        version: number,
-        saved_by: saved_by.to_owned(),
-        saved_at: saved_at.to_owned(),
-        sha256: sha256(text),
-    };
-    write_atomic(&folder.join(format!("{number}{EXTENSION}")), text.as_bytes())?;
-    let path = folder.join(format!("{number}.json"));
-    let description = serde_json::to_vec_pretty(&version).map_err(|error| unreadable(&path, error.into()))?;
-    write_atomic(&path, &description)?;
-    Ok(version)
+    sha256: String,
+    /// Recipe, whose permissions the files of its versions have.
+    like: &'f Path,
+}
+
+impl<'f> NewVersion<'f> {
+    fn write(folder: &'f Path, number: u32, text: &str, like: &'f Path) -> Result<Self, FormatError> {
+        write_like(&folder.join(format!("{number}{EXTENSION}")), text.as_bytes(), like)?;
+        Ok(Self { folder, number, sha256: sha256(text), like })
+    }
+
+    fn describe(self, [saved_by, saved_at]: [&str; 2]) -> Result<RecipeVersion, FormatError> {
+        let version = RecipeVersion {
+            version: self.number,
+            saved_by: saved_by.to_owned(),
+            saved_at: saved_at.to_owned(),
+            sha256: self.sha256,
+            damaged: false,
+        };
+        let path = self.folder.join(format!("{}.json", self.number));
+        let description = serde_json::to_vec_pretty(&version).map_err(|error| unreadable(&path, error.into()))?;
+        write_like(&path, &description, self.like)?;
+        Ok(version)
+    }
+
+    fn withdraw(self) {
+        // The next version overwrites it, if it cannot be deleted.
+        let _ = fs::remove_file(self.folder.join(format!("{}{EXTENSION}", self.number)));
+    }
+}
+
+impl RecipeVersion {
+    fn damaged(version: u32) -> Self {
+        Self { version, saved_by: String::new(), saved_at: String::new(), sha256: String::new(), damaged: true }
+    }
+}
+
+/// Replaces the text `present` of the file `path`, or creates the file. Returns false and changes nothing if another
+/// program has changed or created the file meanwhile.
+fn replace(path: &Path, text: &str, present: Option<&str>) -> Result<bool, FormatError> {
+    let mut draft = if present.is_some() { Draft::create_private(path)? } else { Draft::create(path)? };
+    draft.write(text.as_bytes())?;
+    match present {
+        Some(present) => draft.publish_over(present.as_bytes()),
+        None => draft.publish_new(),
+    }
+}
+
+/// Writes a file with the owner and the permissions of the file `like`, if that one exists.
+fn write_like(path: &Path, bytes: &[u8], like: &Path) -> Result<(), FormatError> {
+    let has_pattern = like.exists();
+    let mut draft = if has_pattern { Draft::create_private(path)? } else { Draft::create(path)? };
+    draft.write(bytes)?;
+    if has_pattern {
+        draft.copy_access(like)?;
+    }
+    draft.publish()
+}
+
+/// Deletes the temporary files that a killed program has left in a folder: their names begin with `prefix`.
+fn delete_unfinished(folder: &Path, prefix: &str) {
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        let name = entry.file_name();
+        let name = name.to_string_lossy();
+        if name.starts_with(prefix) && name.ends_with(".tmp") {
+            // It takes room, and does no other harm.
+            let _ = fs::remove_file(entry.path());
+        }
+    }
+}
+
+/// Returns true if a text has a table `[part]`, as every recipe has.
+fn has_part(text: &str) -> bool {
+    text.lines().any(|line| {
+        let head = line.trim_start().strip_prefix('[').map(str::trim_start);
+        let rest = head.and_then(|head| head.strip_prefix("part")).map(str::trim_start);
+        rest.is_some_and(|rest| rest.starts_with(']'))
+    })
 }
 
 fn read_version(folder: &Path, number: u32) -> Result<RecipeVersion, FormatError> {
@@ -324,7 +448,15 @@ mod tests {
         fs::write(versions.join("1.toml"), "[part]\nname = \"forged\"\n").unwrap();
         assert!(matches!(recipes.text_of_version(NAME, 1), Err(FormatError::ChangedVersion { .. })));
         fs::write(versions.join("1.json"), "{}").unwrap();
-        assert!(recipes.versions(NAME).is_err());
+        assert_eq!(recipes.versions(NAME).unwrap(), [RecipeVersion::damaged(1)]);
+        // It blocks neither the recipe nor its next version.
+        assert_eq!(recipes.text(NAME).unwrap().unwrap(), "[part]\n");
+        let numbers: Vec<u32> = match recipes.save(NAME, "[part]\n# b\n", Some("[part]\n"), BY) {
+            Ok(_) => recipes.versions(NAME).unwrap().iter().map(|version| version.version).collect(),
+            Err(error) => panic!("{error}"),
+        };
+        assert_eq!(numbers, [1, 2, 3]);
+        assert_eq!(recipes.text_of_version(NAME, 2).unwrap().unwrap(), "[part]\n");
     }
 
     #[test]
@@ -367,5 +499,99 @@ mod tests {
         fs::create_dir(home.path().join("folder.toml")).unwrap();
         assert_eq!(recipes.names().unwrap(), Vec::<String>::new());
         assert!(matches!(recipes.text("big.toml"), Err(FormatError::TooLarge { .. })));
+    }
+    #[test]
+    fn only_recipes_are_read_and_written() {
+        let (home, recipes) = folder();
+        let users = "[[user]]\nname = \"A. Smith\"\n";
+        fs::write(home.path().join("users.toml"), users).unwrap();
+        assert!(matches!(recipes.text("users.toml"), Err(FormatError::NoRecipe { .. })));
+        let saved = recipes.save("users.toml", "[part]\n", Some(users), BY);
+        assert!(matches!(saved, Err(FormatError::NoRecipe { .. })), "{saved:?}");
+        let saved = recipes.save("new.toml", "nonsense", None, BY);
+        assert!(matches!(saved, Err(FormatError::NoRecipe { .. })), "{saved:?}");
+        assert_eq!(fs::read_to_string(home.path().join("users.toml")).unwrap(), users);
+        assert!(!home.path().join("new.toml").exists());
+        recipes.save("spaced.toml", " [ part ] # of a mirror\n", None, BY).unwrap();
+        assert_eq!(recipes.names().unwrap(), ["spaced.toml"]);
+    }
+
+    #[test]
+    fn failed_save_leaves_no_version() {
+        let (home, recipes) = folder();
+        fs::write(home.path().join(NAME), "[part]\n# a\n").unwrap();
+        recipes.save(NAME, "[part]\n# b\n", Some("[part]\n# a\n"), BY).unwrap();
+        let before = recipes.versions(NAME).unwrap();
+        // A program changes the file in the moment of saving.
+        fs::write(home.path().join(NAME), "[part]\n# c\n").unwrap();
+        let path = recipes.place(NAME).unwrap().unwrap();
+        assert!(!replace(&path, "[part]\n# d\n", Some("[part]\n# b\n")).unwrap());
+        assert!(!replace(&path, "[part]\n# d\n", None).unwrap());
+        assert_eq!(recipes.text(NAME).unwrap().unwrap(), "[part]\n# c\n");
+        assert_eq!(recipes.versions(NAME).unwrap(), before);
+        let names = fs::read_dir(home.path()).unwrap().map(|entry| entry.unwrap().file_name());
+        assert_eq!(names.filter(|name| name.to_string_lossy().ends_with(".tmp")).count(), 0);
+    }
+
+    #[test]
+    fn second_save_of_one_text_is_no_conflict() {
+        let (_home, recipes) = folder();
+        let first = recipes.save(NAME, "[part]\n", None, BY).unwrap();
+        assert_eq!(recipes.save(NAME, "[part]\n", None, BY).unwrap(), first);
+    }
+
+    #[test]
+    fn held_lock_is_told() {
+        let (home, recipes) = folder();
+        recipes.save(NAME, "[part]\n", None, BY).unwrap();
+        let lock = File::open(home.path().join(VERSIONS).join(NAME).join("lock")).unwrap();
+        lock.lock().unwrap();
+        let saved = recipes.save(NAME, "[part]\n# b\n", Some("[part]\n"), BY);
+        assert!(matches!(saved, Err(FormatError::RecipeBusy { .. })), "{saved:?}");
+    }
+
+    #[cfg(unix)]
+    mod on_unix {
+        use std::os::unix::fs::{PermissionsExt, symlink};
+
+        use super::*;
+
+        fn mode(path: &Path) -> u32 {
+            fs::metadata(path).unwrap().permissions().mode() & 0o777
+        }
+
+        #[test]
+        fn saving_keeps_permissions_and_links() {
+            let (home, recipes) = folder();
+            let (file, link) = (home.path().join("real.toml"), home.path().join(NAME));
+            fs::write(&file, "[part]\n").unwrap();
+            fs::set_permissions(&file, fs::Permissions::from_mode(0o640)).unwrap();
+            symlink("real.toml", &link).unwrap();
+            recipes.save(NAME, "[part]\n# b\n", Some("[part]\n"), BY).unwrap();
+            assert!(link.symlink_metadata().unwrap().is_symlink());
+            assert_eq!(fs::read_to_string(&file).unwrap(), "[part]\n# b\n");
+            let versions = home.path().join(VERSIONS).join(NAME);
+            let files = ["1.toml", "1.json", "2.toml", "2.json"].map(|name| versions.join(name));
+            assert_eq!(
+                [mode(&file)].into_iter().chain(files.iter().map(|file| mode(file))).collect::<Vec<_>>(),
+                [0o640; 5]
+            );
+        }
+
+        #[test]
+        fn links_out_of_the_folder_are_refused() {
+            let (home, recipes) = folder();
+            let elsewhere = tempfile::tempdir().unwrap();
+            fs::write(elsewhere.path().join("a.toml"), "[part]\n").unwrap();
+            symlink(elsewhere.path().join("a.toml"), home.path().join("leak.toml")).unwrap();
+            symlink("nowhere", home.path().join("dangling.toml")).unwrap();
+            for name in ["leak.toml", "dangling.toml"] {
+                assert!(matches!(recipes.text(name), Err(FormatError::RecipeElsewhere { .. })), "{name}");
+                let saved = recipes.save(name, "[part]\n# b\n", None, BY);
+                assert!(matches!(saved, Err(FormatError::RecipeElsewhere { .. })), "{name}");
+            }
+            assert_eq!(recipes.names().unwrap(), Vec::<String>::new());
+            assert_eq!(fs::read_to_string(elsewhere.path().join("a.toml")).unwrap(), "[part]\n");
+        }
     }
 }

@@ -243,7 +243,7 @@ impl<'p> Draft<'p> {
     /// Creates a temporary file in the folder of `path`. Only the owner can read the temporary file. [`Self::publish`]
     /// renames the temporary file to `path`. If `publish` is not called, the temporary file is removed when this value
     /// is dropped. Returns an error if `path` is a folder, a device or a pipe, or if the file cannot be created.
-    fn create_private(path: &'p Path) -> Result<Self, FormatError> {
+    pub(super) fn create_private(path: &'p Path) -> Result<Self, FormatError> {
         Self::create_by(path, system::create_owners)
     }
 
@@ -283,6 +283,51 @@ impl<'p> Draft<'p> {
         fs::rename(&self.temporary, self.path).map_err(self.failed("renaming it"))?;
         self.published = true;
         sync_folder(self.path).map_err(self.failed("flushing it to the disk"))
+    }
+
+    /// Like [`Self::publish`], but returns false and does nothing if the file exists already.
+    pub(super) fn publish_new(mut self) -> Result<bool, FormatError> {
+        self.flush()?;
+        match fs::hard_link(&self.temporary, self.path) {
+            Ok(()) => sync_folder(self.path).map_err(self.failed("flushing it to the disk")).map(|()| true),
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(false),
+            // A file system without hard links.
+            Err(_) if !self.path.exists() => self.publish().map(|()| true),
+            Err(error) => Err(self.failed("creating it")(error)),
+        }
+    }
+
+    /// Like [`Self::publish`], but replaces a file with the content `seen` only, and keeps its owner and permissions.
+    /// Returns false and does nothing if the content is another one.
+    pub(super) fn publish_over(mut self, seen: &[u8]) -> Result<bool, FormatError> {
+        self.copy_access(self.path)?;
+        self.flush()?;
+        let is_seen = |path: &Path| {
+            let has_length = fs::metadata(path).is_ok_and(|there| there.len() == seen.len() as u64);
+            has_length && fs::read(path).is_ok_and(|content| content == seen)
+        };
+        let exchange = |draft: &Self| system::exchange(&draft.temporary, draft.path);
+        if !is_seen(self.path) {
+            return Ok(false);
+        }
+        if !exchange(&self).map_err(self.failed("replacing it"))? {
+            return self.publish().map(|()| true);
+        }
+        // The file of before has the temporary name now, so a change of the last moment is still there.
+        if is_seen(&self.temporary) {
+            return sync_folder(self.path).map_err(self.failed("flushing it to the disk")).map(|()| true);
+        }
+        if let Err(error) = exchange(&self) {
+            // The text of the other program stays under the temporary name.
+            self.published = true;
+            return Err(self.failed("restoring it")(error));
+        }
+        Ok(false)
+    }
+
+    /// Gives the temporary file the owner and the permissions of the file `like`.
+    pub(super) fn copy_access(&self, like: &Path) -> Result<(), FormatError> {
+        system::copy_access(like, self.file.get_ref()).map_err(self.failed("keeping its permissions"))
     }
 
     fn flush(&mut self) -> Result<(), FormatError> {

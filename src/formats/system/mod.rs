@@ -13,7 +13,9 @@ use unix as here;
 #[cfg(windows)]
 use windows as here;
 
-pub(super) use here::{create_owners, create_owners_folder, is_socket, open_to_read, sync_folder};
+pub(super) use here::{
+    copy_access, create_owners, create_owners_folder, exchange, is_socket, open_to_read, sync_folder,
+};
 pub use open_to_others::OpenToOthers;
 
 /// Returns the permission that lets users other than the owner read the file `path`, and the command that removes this

@@ -14,6 +14,27 @@ pub(crate) fn create_owners(path: &Path) -> io::Result<File> {
     OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
 }
 
+/// Gives the open file `to` the owner, the group and the permissions of the file `from`. If this program may not give
+/// the file away, the group has only the permissions that all others have.
+pub(crate) fn copy_access(from: &Path, to: &File) -> io::Result<()> {
+    let pattern = fs::metadata(from)?;
+    let is_given = std::os::unix::fs::fchown(to, Some(pattern.uid()), Some(pattern.gid())).is_ok();
+    let mode = pattern.mode() & 0o777;
+    let mode = if is_given { mode } else { mode & (0o707 | (mode & 0o007) << 3) };
+    to.set_permissions(fs::Permissions::from_mode(mode))
+}
+
+/// Exchanges the names of two files in one step. Returns false if the file system cannot do this.
+pub(crate) fn exchange(one: &Path, other: &Path) -> io::Result<bool> {
+    use rustix::fs::{CWD, RenameFlags, renameat_with};
+    use rustix::io::Errno;
+    match renameat_with(CWD, one, CWD, other, RenameFlags::EXCHANGE) {
+        Ok(()) => Ok(true),
+        Err(Errno::INVAL | Errno::NOSYS | Errno::NOTSUP) => Ok(false),
+        Err(error) => Err(error.into()),
+    }
+}
+
 /// Creates a folder in `parent` that only its owner can read. Its name begins with `prefix`.
 pub(crate) fn create_owners_folder(prefix: &str, parent: &Path) -> io::Result<TempDir> {
     tempfile::Builder::new().prefix(prefix).permissions(fs::Permissions::from_mode(0o700)).tempdir_in(parent)

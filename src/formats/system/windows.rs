@@ -20,6 +20,16 @@ pub(crate) fn create_owners_folder(prefix: &str, parent: &Path) -> io::Result<Te
     tempfile::Builder::new().prefix(prefix).tempdir_in(parent)
 }
 
+/// Does nothing: on Windows a file has the permissions of its folder.
+pub(crate) fn copy_access(_from: &Path, _to: &File) -> io::Result<()> {
+    Ok(())
+}
+
+/// Returns false: Windows cannot exchange the names of two files.
+pub(crate) fn exchange(_one: &Path, _other: &Path) -> io::Result<bool> {
+    Ok(false)
+}
+
 /// Returns true if the full paths of `one` and `other`, with all links followed, are equal. Two names of one file by a
 /// hard link are not detected.
 ///
