@@ -165,14 +165,20 @@ pub(super) fn cell_notes(cell: &CellConfig) -> Vec<String> {
     cell.notes().into_iter().chain(cell.calibration_notes(&regrind::report::today())).collect()
 }
 
-/// Returns true if a line of the file at `path` begins with one of the table headers in `heads`. The headers show the
-/// kind of a file, even if the rest of the file is invalid. Only the first MiB is read. Returns false if the file
+/// Returns true if the file at `path` has one of the tables whose heads are in `heads`. In a file that is not correct
+/// TOML, a line that begins with the head counts as the table. Only the first MiB is read. Returns false if the file
 /// cannot be read.
 pub(super) fn has_table(path: &Path, heads: &[&str]) -> bool {
     const ENOUGH_BYTES: u64 = 1 << 20;
     let mut bytes = Vec::new();
     let read = File::open(path).and_then(|file| file.take(ENOUGH_BYTES).read_to_end(&mut bytes));
     let text = String::from_utf8_lossy(&bytes);
+    if let Ok(tables) = text.parse::<toml::Table>() {
+        let is_table = |value: &toml::Value| value.is_table() || value.is_array();
+        let name = |head: &&str| head.trim_matches(['[', ']', '.']).to_owned();
+        return heads.iter().any(|head| tables.get(&name(head)).is_some_and(is_table));
+    }
+    // A file that is not correct yet has the heads of its tables at the beginnings of lines.
     read.is_ok() && text.lines().any(|line| heads.iter().any(|head| line.trim_start().starts_with(head)))
 }
 

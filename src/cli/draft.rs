@@ -25,6 +25,7 @@ use serde::Serialize;
 
 use super::check::{ProblemDocument, with_good_files};
 use super::failure::Failure;
+use super::outcome::FAULT;
 use super::plan::{PlanDocument, PlannedRun};
 use super::run_plan::path_picture;
 use super::{Outcome, outside};
@@ -60,6 +61,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     outside::give_way_to_all();
     let mut text = String::new();
     // A longer text is a text with a problem, so one byte more than allowed is enough.
+    outside::end_with_reader(FAULT.into());
     io::stdin().take(RecipeFolder::MAX_BYTES + 1).read_to_string(&mut text).map_err(Failure::Terminal)?;
     let recipe = match checked(arguments, &text) {
         Ok(recipe) => recipe,
@@ -101,10 +103,11 @@ fn checked(arguments: &Arguments, text: &str) -> Result<Recipe, Problems> {
 pub(super) fn read_draft(path: &Path, text: &str) -> Result<Recipe, Problems> {
     let recipe = Recipe::parse(path, text)?;
     let folder = path.parent().and_then(|folder| folder.canonicalize().ok());
-    let is_elsewhere = |file: &&Path| match (file.canonicalize(), &folder) {
-        (Ok(file), Some(folder)) => !file.starts_with(folder),
-        // A file that does not exist is told later, without its content.
-        _ => false,
+    // A file that does not exist is where its folder is: whether files exist elsewhere is not told.
+    let place = |file: &Path| file.ancestors().find_map(|above| above.canonicalize().ok());
+    let is_elsewhere = |file: &&Path| match (place(file), &folder) {
+        (Some(place), Some(folder)) => !place.starts_with(folder),
+        _ => true,
     };
     let of_nominal = matches!(&recipe.nominal, NominalSource::File { path, .. } if is_elsewhere(&path.as_path()));
     let key = if of_nominal { "nominal.file" } else { "measure.file" };

@@ -19,7 +19,7 @@ pub enum FormatError {
     Unreadable { path: PathBuf, source: io::Error },
     /// The name of a recipe is not plain.
     #[error(
-        "`{}` is no name for a recipe; write letters, digits, spaces, `-` or `_`, at most 95 bytes, and `.toml` at the end",
+        "`{}` is no name for a recipe; write letters, digits, spaces or signs except / \\ : * ? < > | and \", at most 95 bytes, and `.toml` at the end",
         name.escape_debug()
     )]
     RecipeName { name: String },

@@ -76,7 +76,10 @@ impl RecipeFolder {
     /// that a system does not allow in names.
     pub fn file(&self, name: &str) -> Option<PathBuf> {
         let stem = name.strip_suffix(EXTENSION)?;
-        let is_plain = |c: char| !c.is_control() && !matches!(c, '/' | '\\' | ':' | '*' | '?' | '"' | '<' | '>' | '|');
+        let is_invisible = |c: char| matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2060}'..='\u{206f}' | '\u{feff}');
+        let is_plain = |c: char| {
+            !c.is_control() && !is_invisible(c) && !matches!(c, '/' | '\\' | ':' | '*' | '?' | '"' | '<' | '>' | '|')
+        };
         let is_good = !stem.trim().is_empty()
             && name.len() <= MAX_NAME_BYTES
             && !name.starts_with(['.', ' '])
@@ -195,9 +198,8 @@ impl RecipeFolder {
         delete_unfinished(&folder, ".");
         delete_unfinished(&self.0, &format!(".{name}."));
         let present = self.text(name)?;
-        let is_saved = |last: &RecipeVersion, text: &str| !last.damaged && last.sha256 == sha256(text);
         let mut versions = self.versions(name)?;
-        if let Some(last) = versions.last().filter(|last| is_saved(last, text))
+        if let Some(last) = versions.last().filter(|last| last.is_text(text))
             && present.as_deref() == Some(text)
         {
             return Ok(last.clone());
@@ -206,7 +208,7 @@ impl RecipeFolder {
             return Err(FormatError::ChangedMeanwhile { path });
         }
         if let Some(present) = &present
-            && versions.last().is_none_or(|last| !is_saved(last, present))
+            && versions.last().is_none_or(|last| !last.is_text(present))
         {
             let of_other = NewVersion::write(&folder, next(&versions), present, &path)?;
             versions.push(of_other.describe(["", ""])?);
@@ -305,6 +307,11 @@ impl<'f> NewVersion<'f> {
 }
 
 impl RecipeVersion {
+    /// Returns true if this is the version of `text`.
+    pub fn is_text(&self, text: &str) -> bool {
+        !self.damaged && self.sha256 == sha256(text)
+    }
+
     fn damaged(version: u32) -> Self {
         Self { version, saved_by: String::new(), saved_at: String::new(), sha256: String::new(), damaged: true }
     }
@@ -476,6 +483,8 @@ mod tests {
             "con.toml",
             "COM1.x.toml",
             "a\n.toml",
+            "a\u{202e}b.toml",
+            "a\u{200b}.toml",
             "a .toml",
             "a..toml",
             " a.toml",

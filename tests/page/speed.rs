@@ -2,14 +2,14 @@
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use regrind_testcell::browser::{Browser, Tab};
 use regrind_testcell::http::Visitor;
 
 use crate::program::{Running, changed, regrind, replaced, small_recipe};
-use crate::workbench::post;
+use crate::workbench::{of_simulation, post, simulate};
 use crate::{CellPage, serve_with};
 
 /// Number of repetitions of each time.
@@ -171,13 +171,14 @@ fn hold_is_fast_beside_other_programs() {
     let speed = ("[simulation]\nseed = 1", "[simulation]\nseed = 1\nspeed = 1e6");
     let text = changed("recipes/freeform-mirror.toml", &[speed]);
     let visitor = Visitor::with_key(&url);
-    let (is_over, simulations) = (AtomicBool::new(false), AtomicUsize::new(0));
+    let (is_over, simulations, last_id) = (AtomicBool::new(false), AtomicUsize::new(0), AtomicU64::new(0));
     std::thread::scope(|scope| {
         scope.spawn(|| {
             while !is_over.load(Ordering::Relaxed) {
-                let task = serde_json::json!({ "text": text, "seed": simulations.fetch_add(1, Ordering::Relaxed) });
-                assert_eq!(post(&visitor, "/recipes/small.toml/simulation", &task).0, 204);
-                assert_eq!(visitor.get("/recipes/small.toml/simulation/events").status, 200);
+                let id = simulate(&visitor, &text);
+                last_id.store(id, Ordering::Relaxed);
+                simulations.fetch_add(1, Ordering::Relaxed);
+                assert_eq!(visitor.get(&of_simulation("events", id)).status, 200);
             }
         });
         let began = (Instant::now(), processor_of_children_s(&page));
@@ -186,7 +187,7 @@ fn hold_is_fast_beside_other_programs() {
         let share = (processor_of_children_s(&page) - began.1) / began.0.elapsed().as_secs_f64();
         println!("HOLD to HOLDING on the page, beside a simulation, {median:.0} ms");
         println!("{simulations:?} simulations, {:.0} % of a core", 100.0 * share);
-        post(&visitor, "/recipes/small.toml/simulation/end", &serde_json::json!(null));
+        post(&visitor, &of_simulation("end", last_id.load(Ordering::Relaxed)), &serde_json::json!(null));
     });
     shown.run.signal("KILL");
 }

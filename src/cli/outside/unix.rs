@@ -10,6 +10,9 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::{Ending, LOWEST_STEPS};
 
+/// Memory that each child program may use, also on a small computer.
+const MIN_MEMORY_BYTES: u64 = 1 << 30;
+
 /// Events that end a program from outside: a closed terminal, a stopped service.
 pub(crate) struct Endings {
     /// `None` if the program was started to outlive its terminal (`nohup`).
@@ -76,16 +79,42 @@ pub(crate) fn give_way(steps: i32) {
     let _ = rustix::process::nice(steps);
 }
 
-/// Lowers the scheduling priority of this process below all others, if the system permits it. A process that a person
-/// started in a shell stays in the session of the shell.
+/// Lowers the scheduling priority of this process below all others, if the system permits it, and limits its memory to a
+/// quarter of that of the computer. A process that a person started in a shell stays in the session of the shell.
 pub(crate) fn give_way_to_all() {
+    use rustix::process::{Resource, Rlimit, setrlimit};
+    let memory = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
+    let total_kb =
+        memory.lines().find_map(|line| line.strip_prefix("MemTotal:")?.trim().strip_suffix(" kB")?.parse().ok());
+    let limit =
+        total_kb.map(|kb: u64| (kb << 10) / 4).map_or(MIN_MEMORY_BYTES, |quarter| quarter.max(MIN_MEMORY_BYTES));
+    // A limit that is lower already stays. When memory is short, the system ends this process first.
+    let _ = setrlimit(Resource::Data, Rlimit { current: Some(limit), maximum: Some(limit) });
+    let _ = tell_system("oom_score_adj", "1000");
     // Linux shares the processor between sessions first, and regards priorities only within a session. A process that
     // leads a process group cannot leave its session.
     if rustix::process::setsid().is_ok() {
         // A system without autogroups has no such file.
-        let _ = std::fs::write("/proc/self/autogroup", LOWEST_STEPS.to_string());
+        let _ = tell_system("autogroup", &LOWEST_STEPS.to_string());
     }
     give_way(LOWEST_STEPS);
+}
+
+/// Gives the system a setting of this process, by the name of its file in `/proc`.
+fn tell_system(name: &str, value: &str) -> io::Result<()> {
+    use std::io::Write;
+    let path = PathBuf::from("/proc/self").join(name);
+    std::fs::File::options().write(true).open(path)?.write_all(value.as_bytes())
+}
+
+/// Ends this process when nobody reads its output any more: the program that started it has gone.
+pub(crate) fn end_with_reader(code: i32) {
+    std::thread::spawn(move || {
+        let stdout = rustix::stdio::stdout();
+        // Without a wish for events, a pipe tells only that its other end was closed.
+        while poll(&mut [PollFd::from_borrowed_fd(stdout, PollFlags::empty())], None).is_err() {}
+        std::process::exit(code)
+    });
 }
 
 /// Puts a child program, before its start, into a process group of its own. Ctrl-C at the terminal of this program then

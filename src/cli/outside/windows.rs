@@ -79,6 +79,9 @@ pub(crate) fn give_way(_steps: i32) {}
 /// Does nothing, like [`give_way`].
 pub(crate) fn give_way_to_all() {}
 
+/// Does nothing: a program ends when it writes and nobody reads.
+pub(crate) fn end_with_reader(_code: i32) {}
+
 /// Sets the start options of a child program so that Ctrl-C at the terminal of this program does not end the child.
 pub(crate) fn set_apart(command: &mut Command) {
     std::os::windows::process::CommandExt::creation_flags(command, NEW_GROUP);

@@ -137,6 +137,20 @@ const regrindWorkbench = (() => {
     }
   }
 
+  /** An answer that cannot be used, in words. A sign-in page in place of JSON is an answer to a person who is signed out. */
+  async function refusal(answer, texts) {
+    const isJson = (answer.headers.get("content-type") || "").includes("json");
+    if (isJson) return (await answer.json()).message;
+    return answer.ok || answer.status === 401 || answer.status === 403 ? texts.signedOut : `${answer.status} ${await answer.text()}`.trim();
+  }
+
+  /** A text without the difference of line ends, as the editor has it. */
+  const plain = (text) => (text === null ? null : text.replaceAll("\r\n", "\n").replaceAll("\r", "\n"));
+  /** A text of the editor with the line ends of a file. */
+  const withEndsOf = (file, text) => (file && file.includes("\r\n") && !/(^|[^\r])\n/.test(file) ? text.replaceAll("\n", "\r\n") : text);
+  /** The bytes of an answer as text. A mark of the byte order stays, because it is part of the file. */
+  const textOf = async (answer) => new TextDecoder("utf-8", { ignoreBOM: true }).decode(await answer.arrayBuffer());
+
   function problemText({ found, allowed, remedy, key }) {
     return [`${key ? `${key} ` : ""}${found}`, allowed, remedy].filter(Boolean).join("; ");
   }
@@ -144,7 +158,7 @@ const regrindWorkbench = (() => {
   /** Rows of the plan: what it is, and its figures. */
   function planRows(plan, texts) {
     const rows = [];
-    const add = (name, ...values) => rows.push([name, values.filter(Boolean).map((value) => value.replaceAll(" ", "\u00a0")).join(", ")]);
+    const add = (name, ...values) => rows.push([name, values.filter(Boolean).map((value, k, all) => `${value}${k + 1 < all.length ? "," : ""}`.replaceAll(" ", "\u00a0")).join(" ")]);
     const least = plan.least_measuring_minutes;
     add(texts.measuring, plan.targets ? `${number(plan.targets, 6)} ${texts.touches}` : "", least === undefined ? "" : filled(texts.atLeastMinutes, number(least)));
     add(texts.pass, `${number(plan.tracks, 6)} ${texts.trackCount}`, filled(texts.minutes, number(plan.grinding_minutes)));
@@ -162,15 +176,14 @@ const regrindWorkbench = (() => {
   function planNodes(plan, texts) {
     const list = made("dl", { className: "rows" });
     for (const [name, value] of planRows(plan, texts)) list.append(made("dt", { textContent: name }), made("dd", { textContent: value }));
-    const weak = plan.weak_directions.map(({ words }) => made("p", { className: "warns weak" }, made("strong", { textContent: `${texts.weak}: ` }), `${words}. ${texts.weakRemedy}`));
+    const weak = plan.weak_directions.map(({ words }) => made("p", { className: "warns weak" }, made("strong", { textContent: `${texts.weak}: ` }), made("span", { lang: "en", textContent: `${words}. ` }), texts.weakRemedy));
     const warnings = plan.warnings.map((words) => made("p", { className: "warns" }, made("strong", { textContent: `${texts.warning}: ` }), words));
     return [list, ...weak, ...warnings];
   }
 
   function begin() {
-    const { name, text, skeleton, versions, texts } = data();
+    const { name, text, skeleton, versions, texts, simulated, person, folder } = data();
     const path = `/recipes/${encodeURIComponent(name)}`;
-    const kept = `regrind-draft ${name}`;
     /** Text of the file as this page knows it; null for a file that does not exist. */
     let onDisk = text;
     let [shape, view, checking, isGood] = [null, "surface", null, false];
@@ -181,28 +194,35 @@ const regrindWorkbench = (() => {
       element("said").classList.toggle("no", isBad);
     };
 
-    const draft = keptText(kept);
-    const first = draft.get() ?? text ?? skeleton;
+    const draft = keptText(`regrind-draft ${JSON.stringify([person, folder, name])}`);
+    const found = draft.get();
+    const first = found ? found.text : plain(text) ?? skeleton;
     let complete = () => null;
     const editor = codeMirror.edit(hosts.editor, { text: first, label: texts.editor, changed, complete: (context) => complete(context) });
     fetch("/recipe-schema").then((answer) => answer.json()).then((schema) => { complete = regrindCompletion.source(schema); }).catch(() => {});
-    if (draft.get() !== null && draft.get() !== text) {
+    if (found && found.text !== plain(text)) {
+      // A text that was written over another one does not overwrite it unseen.
+      const isOld = found.base !== text;
+      if (isOld) onDisk = found.base;
       const discard = made("button", { type: "button", textContent: texts.discardDraft });
       discard.addEventListener("click", () => {
-        editor.setText(onDisk ?? skeleton);
+        onDisk = text;
+        editor.setText(plain(onDisk) ?? skeleton);
+        draft.remove();
         say("");
       });
-      say(texts.draftKept);
+      say(isOld ? texts.draftOfOldFile : texts.draftKept, isOld);
       element("said").append(" ", discard);
     }
 
     function changed() {
       const now = editor.text();
-      const isChanged = now !== onDisk;
+      const isChanged = now !== (plain(onDisk) ?? skeleton);
       element("changed").hidden = !isChanged;
-      if (isChanged) draft.set(now);
+      if (isChanged) draft.set({ text: now, base: onDisk });
       else draft.remove();
       setGood(false);
+      markSimulation();
       element("problem-count").textContent = texts.checks;
       clearTimeout(checking);
       checking = setTimeout(check, WAIT_MS);
@@ -211,18 +231,27 @@ const regrindWorkbench = (() => {
     function setGood(good) {
       isGood = good;
       element("simulate").disabled = !good;
-      element("save").disabled = !good || editor.text() === onDisk;
+      element("save").disabled = !good || editor.text() === plain(onDisk);
     }
 
-    let [aborted, problems] = [new AbortController(), []];
+    let [aborted, problems, isFault] = [new AbortController(), [], false];
     async function check() {
       aborted.abort();
       aborted = new AbortController();
       const { signal } = aborted;
       const sent = editor.text();
+      problems = [];
       try {
         const answer = await fetch(`${path}/draft`, { method: "POST", body: sent, headers: { "Content-Type": "text/plain" }, signal });
-        if (!answer.ok) throw new Error((await answer.json()).message);
+        if (answer.status === 503) {
+          // The texts of other people are checked: this one comes after them.
+          checking = setTimeout(check, 1000);
+          return;
+        }
+        const isLines = (answer.headers.get("content-type") || "").includes("ndjson");
+        if (!answer.ok || !isLines) throw new Error(await refusal(answer, texts));
+        if (isFault) say("");
+        isFault = false;
         let last = "";
         await eachLine(answer, (line) => {
           last = line.kind;
@@ -231,7 +260,11 @@ const regrindWorkbench = (() => {
         // The program was ended at its limit of time or size: what is shown is not that of this text.
         if (!signal.aborted && !(["shape", "refused"].includes(last) || problems.length)) showNoPlan(texts.noAnswer, true);
       } catch (error) {
-        if (!signal.aborted) say(String(error.message || error), true);
+        if (signal.aborted) return;
+        isFault = true;
+        say(error instanceof TypeError ? texts.pageGone : String(error.message || error), true);
+        showNoPlan(texts.noAnswer, true);
+        element("problem-count").textContent = texts.noAnswer;
       }
     }
 
@@ -246,6 +279,10 @@ const regrindWorkbench = (() => {
         else {
           setGood(true);
           showNoPlan(texts.checks);
+        }
+        if (isSaveWished) {
+          isSaveWished = false;
+          save();
         }
       } else if (line.kind === "refused") {
         showNoPlan(line.reason, true);
@@ -296,11 +333,18 @@ const regrindWorkbench = (() => {
 
     const listed = element("compared");
     function listVersion(version) {
-      const who = version.saved_by || (version.saved_at ? "" : texts.otherProgram);
-      const words = [`${texts.version} ${version.version}`, version.saved_at.slice(0, 16).replace("T", " "), who].filter(Boolean).join(" · ");
+      const who = version.damaged ? texts.damaged : version.saved_by || (version.saved_at ? "" : texts.otherProgram);
+      const at = version.saved_at ? new Date(version.saved_at).toLocaleString(document.documentElement.lang, { dateStyle: "medium", timeStyle: "short" }) : "";
+      const words = [`${texts.version} ${version.version}`, at, who].filter(Boolean).join(" · ");
       listed.insertBefore(made("option", { value: String(version.version), textContent: words }), listed.options[2] || null);
     }
     versions.forEach(listVersion);
+    /** Adds the versions that the list does not have yet: a save can make two. */
+    async function listNewVersions() {
+      const answer = await fetch(`${path}/versions`);
+      const known = new Set([...listed.options].map((option) => option.value));
+      if (answer.ok) (await answer.json()).filter(({ version }) => !known.has(String(version))).forEach(listVersion);
+    }
     let left = "";
     const showComparison = (isShown) => {
       element("comparison").hidden = !isShown;
@@ -308,16 +352,25 @@ const regrindWorkbench = (() => {
       if (!isShown) listed.value = "";
     };
     listed.addEventListener("change", async () => {
-      if (!listed.value) return showComparison(false);
-      const of = listed.value === "file" ? `${path}/text` : `${path}/versions/${listed.value}`;
+      const chosen = listed.value;
+      if (!chosen) return showComparison(false);
+      const of = chosen === "file" ? `${path}/text` : `${path}/versions/${chosen}`;
       try {
         const answer = await fetch(of);
-        if (!answer.ok) throw new Error((await answer.json()).message);
-        left = await answer.text();
-        if (listed.value === "file") onDisk = left;
+        if (!answer.ok) throw new Error(await refusal(answer, texts));
+        const read = await textOf(answer);
+        // Another version was chosen meanwhile.
+        if (listed.value !== chosen) return undefined;
+        left = plain(read);
+        if (chosen === "file") {
+          onDisk = read;
+          if (editor.text() !== left) draft.set({ text: editor.text(), base: onDisk });
+          setGood(isGood);
+        }
         hosts.texts.replaceChildren();
         showComparison(true);
-        codeMirror.compare(hosts.texts, { before: left, after: editor.text() });
+        if (left === editor.text()) hosts.texts.append(made("p", { textContent: texts.noDifference }));
+        else codeMirror.compare(hosts.texts, { before: left, after: editor.text(), labels: [texts.before, texts.after], unchanged: texts.unchangedLines });
       } catch (error) {
         showComparison(false);
         say(String(error.message || error), true);
@@ -330,22 +383,34 @@ const regrindWorkbench = (() => {
       showComparison(false);
     });
 
+    let [isSaving, isSaveWished] = [false, false];
     async function save() {
-      if (!isGood) return;
+      if (isSaving || editor.text() === plain(onDisk)) return;
+      if (!isGood) {
+        // The check of this text is under way: it is saved as soon as it is found good.
+        isSaveWished = !problems.length;
+        say(texts.hasProblems, true);
+        return;
+      }
+      isSaving = true;
       const sent = editor.text();
+      const content = withEndsOf(onDisk, sent);
       try {
-        const answer = await regrindPost(`${path}/save`, JSON.stringify({ text: sent, replaces: onDisk }));
+        const answer = await regrindPost(`${path}/save`, JSON.stringify({ text: content, replaces: onDisk }));
+        if (!answer.ok) throw new Error(await refusal(answer, texts));
         const said = await answer.json();
-        if (!answer.ok) throw new Error(said.message);
-        onDisk = sent;
-        if (![...listed.options].some((option) => option.value === String(said.version))) listVersion(said);
+        onDisk = content;
+        await listNewVersions();
         element("version").textContent = `${texts.version} ${said.version}`;
         say(`${texts.saved} ${said.version}`);
-        element("changed").hidden = editor.text() === onDisk;
-        if (editor.text() === onDisk) draft.remove();
+        element("changed").hidden = editor.text() === sent;
+        if (editor.text() === sent) draft.remove();
+        else draft.set({ text: editor.text(), base: onDisk });
         setGood(isGood);
       } catch (error) {
-        say(String(error.message || error), true);
+        say(error instanceof TypeError ? texts.pageGone : String(error.message || error), true);
+      } finally {
+        isSaving = false;
       }
     }
     element("save").addEventListener("click", save);
@@ -356,40 +421,54 @@ const regrindWorkbench = (() => {
       }
     });
 
-    let events = null;
+    /** Simulation that is shown: its number and its text; null if none is shown. */
+    let [events, shown] = [null, simulated];
+    function markSimulation() {
+      element("earlier-text").hidden = !shown || shown.text === editor.text();
+    }
     function follow() {
       if (events) events.close();
-      events = new EventSource(`${path}/simulation/events`);
+      if (!shown) return;
+      const { id } = shown;
+      events = new EventSource(`${path}/simulation/events?id=${id}`);
       events.onmessage = ({ data: sent }) => {
         const { html, isOver } = JSON.parse(sent);
         element("simulation").innerHTML = html;
         element("end-simulation").hidden = isOver;
+        markSimulation();
         if (!isOver) return;
         events.close();
         const figure = element("last-map");
         const picture = figure.querySelector("img");
-        picture.src = `${picture.dataset.src}?${Date.now()}`;
+        picture.src = `${picture.dataset.src}?id=${id}`;
         picture.onload = () => { figure.hidden = false; };
+        figure.querySelector("a").href = `${figure.querySelector("a").dataset.href}?id=${id}`;
       };
-      // Without a simulation the stream ends at once.
-      events.onerror = () => events.close();
+      events.onerror = () => {
+        // The browser tries again by itself, unless the page has refused the stream.
+        if (events.readyState === EventSource.CLOSED) say(texts.pageGone, true);
+      };
     }
     element("simulate").addEventListener("click", async () => {
-      const seed = Number(element("seed").value) || 0;
+      const field = element("seed");
+      if (!field.value || !field.checkValidity()) return say(texts.badSeed, true);
+      const sent = editor.text();
       element("simulation").replaceChildren(made("p", { className: "quiet", textContent: texts.simulates }));
       element("last-map").hidden = true;
       try {
-        const answer = await regrindPost(`${path}/simulation`, JSON.stringify({ text: editor.text(), seed }));
-        if (!answer.ok) throw new Error((await answer.json()).message);
+        const answer = await regrindPost(`${path}/simulation`, JSON.stringify({ text: sent, seed: Number(field.value) }));
+        if (!answer.ok) throw new Error(await refusal(answer, texts));
+        shown = { id: (await answer.json()).id, text: sent };
         follow();
       } catch (error) {
-        element("simulation").replaceChildren(made("p", { className: "warns", textContent: String(error.message || error) }));
+        element("simulation").replaceChildren(made("p", { className: "warns", textContent: error instanceof TypeError ? texts.pageGone : String(error.message || error) }));
       }
+      return undefined;
     });
     element("end-simulation").addEventListener("click", async () => {
-      await regrindPost(`${path}/simulation/end`, "");
       element("end-simulation").hidden = true;
-      element("simulation").replaceChildren();
+      // The stream of events tells the end.
+      if (shown) await regrindPost(`${path}/simulation/end?id=${shown.id}`, "");
     });
     follow();
     changed();
@@ -405,8 +484,18 @@ const regrindWorkbench = (() => {
         return null;
       }
     };
+    /** Name of this tab, which a reload keeps. */
+    const tab = safely(() => sessionStorage.getItem("regrind-tab")) || String(Math.random());
+    safely(() => sessionStorage.setItem("regrind-tab", tab));
+    const read = () => safely(() => JSON.parse(localStorage.getItem(key)));
     return {
-      get: () => safely(() => localStorage.getItem(key)), set: (text) => safely(() => localStorage.setItem(key, text)), remove: () => safely(() => localStorage.removeItem(key)),
+      get: () => {
+        const found = read();
+        return found && typeof found.text === "string" ? found : null;
+      },
+      set: (draft) => safely(() => localStorage.setItem(key, JSON.stringify({ ...draft, tab }))),
+      // A text that another tab has kept stays.
+      remove: () => safely(() => { if ((read() || {}).tab === tab) localStorage.removeItem(key); }),
     };
   }
 

@@ -12,14 +12,16 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream::unfold;
 use regrind_formats::RecipeFolder;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use serde::Deserialize;
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::process::{Child, ChildStdout, Command};
-use tokio::sync::OwnedSemaphorePermit;
-use tokio::time::{Instant, timeout_at};
+use tokio::sync::{OwnedSemaphorePermit, oneshot};
+use tokio::time::{Instant, sleep, timeout, timeout_at};
 
 use super::super::guard::{Session, foreign_origin};
 use super::super::shared::Shared;
 use super::access::{for_engineer, refused};
+use super::state::Workbench;
 
 /// Maximum duration of the check and plan of one text.
 const MAX_DURATION: Duration = Duration::from_secs(120);
@@ -28,20 +30,47 @@ const MAX_ANSWER_BYTES: usize = 32 << 20;
 /// Size of a piece of the answer, in bytes.
 const PIECE_BYTES: usize = 64 << 10;
 
+/// Maximum time for which a text waits for the checks of others.
+const MAX_WAIT: Duration = Duration::from_secs(15);
+/// Maximum duration of the check of a text that is to be saved, without its plan.
+const MAX_CHECK_DURATION: Duration = Duration::from_secs(20);
+
 /// Child program whose output goes to a browser. It ends when the browser has gone, because the value is dropped.
 struct Answer {
     _child: Child,
-    _permit: OwnedSemaphorePermit,
+    _permit: Option<OwnedSemaphorePermit>,
+    _draft: PersonalDraft,
+    /// Ends when the same person has sent a later text.
+    replaced: oneshot::Receiver<()>,
     output: ChildStdout,
     until: Instant,
     left_bytes: usize,
 }
 
+/// Draft of a person, registered until it is dropped.
+struct PersonalDraft {
+    page: Shared,
+    person: String,
+    number: u64,
+}
+
+impl Drop for PersonalDraft {
+    fn drop(&mut self) {
+        if let Some(workbench) = &self.page.workbench {
+            workbench.forget_draft(&self.person, self.number);
+        }
+    }
+}
+
 impl Answer {
-    /// Returns the next piece of the output; `None` at its end, at the time limit and at the size limit.
+    /// Returns the next piece of the output; `None` at its end, at the time limit, at the size limit, and after a later
+    /// text of the same person.
     async fn next(&mut self) -> Option<Bytes> {
         let mut piece = vec![0; PIECE_BYTES.min(self.left_bytes)];
-        let read = timeout_at(self.until, self.output.read(&mut piece)).await.ok()?.ok()?;
+        let read = tokio::select! {
+            read = timeout_at(self.until, self.output.read(&mut piece)) => read.ok()?.ok()?,
+            _ = &mut self.replaced => return None,
+        };
         piece.truncate(read);
         self.left_bytes -= read;
         (read > 0).then(|| piece.into())
@@ -49,7 +78,8 @@ impl Answer {
 }
 
 /// Checks and plans the text in `body` as the recipe named `name`. The response is the output of the child program:
-/// lines of JSON, each as soon as it is known. A browser that ends the connection ends the child program.
+/// lines of JSON, each as soon as it is known. A browser that ends the connection ends the child program, and so does a
+/// later text of the same person.
 pub(crate) async fn draft(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -70,12 +100,25 @@ pub(crate) async fn draft(
         return refused(StatusCode::NOT_FOUND, "this is no name for a recipe");
     };
     if body.len() as u64 > RecipeFolder::MAX_BYTES {
-        return refused(StatusCode::PAYLOAD_TOO_LARGE, "the text of a recipe has at most 1 MiB");
+        return refused(StatusCode::PAYLOAD_TOO_LARGE, "the text of a recipe has at most 256 KiB");
     }
-    let Ok(permit) = Arc::clone(&workbench.drafts).acquire_owned().await else {
-        return StatusCode::SERVICE_UNAVAILABLE.into_response();
+    let draft = PersonalDraft { page: page.clone(), person: person_at(&session), number: workbench.next_number() };
+    let mut replaced = workbench.begin_draft(&draft.person, draft.number);
+    let permit = tokio::select! {
+        permit = Arc::clone(&workbench.drafts).acquire_owned() => permit.ok(),
+        _ = &mut replaced => return refused(StatusCode::CONFLICT, "a later text of the same person is checked"),
+        () = sleep(MAX_WAIT) => return refused(StatusCode::SERVICE_UNAVAILABLE, "the texts of other people are checked; wait a moment"),
     };
-    match started(workbench.programs.draft(&path).into(), body, permit) {
+    let started = started(workbench.programs.draft(&path).into(), body).map(|(child, output)| Answer {
+        _child: child,
+        _permit: permit,
+        _draft: draft,
+        replaced,
+        output,
+        until: Instant::now() + MAX_DURATION,
+        left_bytes: MAX_ANSWER_BYTES,
+    });
+    match started {
         Ok(answer) => {
             let pieces = unfold(answer, |mut answer| async {
                 let piece = answer.next().await?;
@@ -83,14 +126,64 @@ pub(crate) async fn draft(
             });
             ([(CONTENT_TYPE, "application/x-ndjson")], Body::from_stream(pieces)).into_response()
         }
-        Err(error) => {
-            refused(StatusCode::INTERNAL_SERVER_ERROR, format!("the program that checks recipes cannot start: {error}"))
+        Err(error) => refused(StatusCode::INTERNAL_SERVER_ERROR, cannot_start(&error)),
+    }
+}
+
+fn cannot_start(error: &std::io::Error) -> String {
+    format!("the program that checks recipes cannot start: {error}")
+}
+
+/// Returns the person at a browser: the name of a person who has signed in, or else the session.
+pub(super) fn person_at(session: &Session) -> String {
+    session.person.as_ref().map_or_else(|| session.id.clone(), |person| person.name.clone())
+}
+
+/// Checks a text that is to be saved as the recipe at `path`, without its plan.
+///
+/// # Errors
+/// Returns the response to the browser if the text has a problem or cannot be checked.
+pub(super) async fn checked(workbench: &Workbench, path: &std::path::Path, text: &str) -> Result<(), Response> {
+    let failed = |words: String| refused(StatusCode::INTERNAL_SERVER_ERROR, words);
+    let (_child, output) = started(workbench.programs.draft(path).into(), Bytes::copy_from_slice(text.as_bytes()))
+        .map_err(|error| failed(cannot_start(&error)))?;
+    let mut line = String::new();
+    let mut output = BufReader::new(output.take(MAX_ANSWER_BYTES as u64));
+    let read = timeout(MAX_CHECK_DURATION, output.read_line(&mut line)).await;
+    let Ok(Checked { problems }) = serde_json::from_str(&line) else {
+        let reason = if read.is_err() { "was not checked within 20 s" } else { "could not be checked" };
+        return Err(failed(format!(
+            "the text {reason}, so it is not saved; simplify it or its files, then save again"
+        )));
+    };
+    match problems.first() {
+        None => Ok(()),
+        Some(first) => {
+            let words = format!(
+                "the text has a problem, so it is not saved: line {}: {} {}",
+                first.line, first.key, first.found
+            );
+            Err(refused(StatusCode::UNPROCESSABLE_ENTITY, words))
         }
     }
 }
 
-/// Starts the child program `command` with `text` on its standard input.
-fn started(mut command: Command, text: Bytes, permit: OwnedSemaphorePermit) -> std::io::Result<Answer> {
+/// First line of the output of the program that checks a text.
+#[derive(Deserialize)]
+struct Checked {
+    problems: Vec<FoundProblem>,
+}
+
+#[derive(Deserialize)]
+struct FoundProblem {
+    line: usize,
+    #[serde(default)]
+    key: String,
+    found: String,
+}
+
+/// Starts the child program `command` with `text` on its standard input. Returns it with its standard output.
+fn started(mut command: Command, text: Bytes) -> std::io::Result<(Child, ChildStdout)> {
     command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null()).kill_on_drop(true);
     let mut child = command.spawn()?;
     let missing = || std::io::Error::other("it has no standard input or output");
@@ -98,6 +191,5 @@ fn started(mut command: Command, text: Bytes, permit: OwnedSemaphorePermit) -> s
     let output = child.stdout.take().ok_or_else(missing)?;
     // A program that does not read is ended with its time.
     tokio::spawn(async move { input.write_all(&text).await });
-    let until = Instant::now() + MAX_DURATION;
-    Ok(Answer { _child: child, _permit: permit, output, until, left_bytes: MAX_ANSWER_BYTES })
+    Ok((child, output))
 }

@@ -13,6 +13,7 @@ use tokio::task::spawn_blocking;
 use super::super::guard::{Session, foreign};
 use super::super::shared::Shared;
 use super::access::{for_engineer, plain, refused};
+use super::draft::checked;
 
 /// Text that a browser saves.
 #[derive(Deserialize)]
@@ -23,8 +24,8 @@ struct ToSave {
     replaces: Option<String>,
 }
 
-/// Saves a text as the recipe named `name` and as its next version. Refuses this if the file was changed since the person
-/// has read it. Responds with the version.
+/// Saves a text as the recipe named `name` and as its next version. Refuses this if the text has a problem, or if the
+/// file was changed since the person has read it. Responds with the version.
 pub(crate) async fn save(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -43,6 +44,16 @@ pub(crate) async fn save(
     let Ok(ToSave { text, replaces }) = serde_json::from_slice(&body) else {
         return refused(StatusCode::BAD_REQUEST, "the request is not that of this page; load the page again");
     };
+    let Some(path) = workbench.recipes.file(&name) else {
+        return refused(StatusCode::BAD_REQUEST, FormatError::RecipeName { name }.to_string());
+    };
+    if text.len() as u64 > RecipeFolder::MAX_BYTES {
+        return refused(StatusCode::PAYLOAD_TOO_LARGE, "the text of a recipe has at most 256 KiB");
+    }
+    let _saving = workbench.saving.lock().await;
+    if let Err(response) = checked(workbench, &path, &text).await {
+        return response;
+    }
     let by = session.person.as_ref().map_or_else(String::new, |person| person.name.clone());
     let now = regrind_report::now();
     on_disk(workbench.recipes.clone(), move |recipes| recipes.save(&name, &text, replaces.as_deref(), [&by, &now]))
@@ -117,17 +128,31 @@ pub(super) async fn on_disk<T: Send + 'static>(
     recipes: RecipeFolder,
     work: impl FnOnce(&RecipeFolder) -> Result<T, FormatError> + Send + 'static,
 ) -> Result<T, Response> {
+    done(recipes, work).await.map_err(|(status, reason)| refused(status, reason))
+}
+
+/// Works with the folder of recipes without blocking other requests.
+///
+/// # Errors
+/// Returns the status of the response, and the reason.
+pub(super) async fn done<T: Send + 'static>(
+    recipes: RecipeFolder,
+    work: impl FnOnce(&RecipeFolder) -> Result<T, FormatError> + Send + 'static,
+) -> Result<T, (StatusCode, String)> {
     match spawn_blocking(move || work(&recipes)).await {
         Ok(Ok(done)) => Ok(done),
-        Ok(Err(error)) => {
-            let status = match error {
-                FormatError::ChangedMeanwhile { .. } => StatusCode::CONFLICT,
-                FormatError::RecipeName { .. } => StatusCode::BAD_REQUEST,
-                FormatError::TooLarge { .. } => StatusCode::PAYLOAD_TOO_LARGE,
-                _ => StatusCode::INTERNAL_SERVER_ERROR,
-            };
-            Err(refused(status, error.to_string()))
-        }
-        Err(_) => Err(StatusCode::INTERNAL_SERVER_ERROR.into_response()),
+        Ok(Err(error)) => Err((status_of(&error), error.to_string())),
+        Err(error) => Err((StatusCode::INTERNAL_SERVER_ERROR, error.to_string())),
+    }
+}
+
+fn status_of(error: &FormatError) -> StatusCode {
+    match error {
+        FormatError::ChangedMeanwhile { .. } => StatusCode::CONFLICT,
+        FormatError::RecipeName { .. } => StatusCode::BAD_REQUEST,
+        FormatError::NoRecipe { .. } | FormatError::RecipeElsewhere { .. } => StatusCode::FORBIDDEN,
+        FormatError::RecipeBusy { .. } => StatusCode::SERVICE_UNAVAILABLE,
+        FormatError::TooLarge { .. } => StatusCode::PAYLOAD_TOO_LARGE,
+        _ => StatusCode::INTERNAL_SERVER_ERROR,
     }
 }

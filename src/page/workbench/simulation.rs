@@ -2,21 +2,20 @@
 
 use std::convert::Infallible;
 use std::sync::Arc;
-use std::time::Duration;
 
-use axum::Extension;
 use axum::body::Bytes;
-use axum::extract::{Path, State};
+use axum::extract::{Path, Query, State};
 use axum::http::header::CONTENT_TYPE;
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::sse::{Event, Sse};
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use futures_util::stream::unfold;
 use maud::{Markup, html};
 use regrind_formats::SimulationFolder;
 use regrind_formats::run_files::CycleFile;
 use regrind_language::Language;
-use regrind_report::ReportOptions;
+use regrind_report::{ReportOptions, RunResult};
 use serde::Deserialize;
 use serde_json::json;
 use tokio::task::spawn_blocking;
@@ -28,12 +27,11 @@ use super::super::pieces::figures;
 use super::super::reader::language;
 use super::super::shared::Shared;
 use super::access::{for_engineer, refused};
-use super::running::{EndedSimulation, Simulation, started};
+use super::draft::person_at;
+use super::running::{EndedSimulation, LOOK_EVERY, Simulation, SimulationTask, started};
 use super::state::Workbench;
 use super::texts::WorkbenchText;
 
-/// Time between two looks at a simulation.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
 /// Text that is to be simulated.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -42,7 +40,14 @@ struct ToSimulate {
     seed: u64,
 }
 
-/// Starts a simulation of a text as the recipe named `name`. A simulation that is under way ends.
+/// Number of a simulation, in an address.
+#[derive(Deserialize)]
+pub(crate) struct OfSimulation {
+    id: u64,
+}
+
+/// Starts a simulation of a text as the recipe named `name`, and responds with its number. A simulation that is under
+/// way ends.
 pub(crate) async fn begin(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -60,33 +65,37 @@ pub(crate) async fn begin(
     let Some(recipe) = workbench.recipes.file(&name) else {
         return refused(StatusCode::NOT_FOUND, "this is no name for a recipe");
     };
-    let folder = match spawn_blocking(move || SimulationFolder::create(&text)).await {
+    let of_folder = text.clone();
+    let folder = match spawn_blocking(move || SimulationFolder::create(&of_folder)).await {
         Ok(Ok(folder)) => Arc::new(folder),
         Ok(Err(error)) => return refused(StatusCode::INSUFFICIENT_STORAGE, error.to_string()),
         Err(_) => return StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     };
     let command = workbench.programs.simulation(&recipe, &folder.draft(), &folder.runs(), seed);
-    match started(command.into(), name, seed, folder) {
+    let id = workbench.next_number();
+    let task = SimulationTask { id, name, text, seed, person: person_at(&session) };
+    match started(command.into(), task, folder) {
         Ok(simulation) => {
             *workbench.simulation() = Some(simulation);
-            StatusCode::NO_CONTENT.into_response()
+            Json(json!({ "id": id })).into_response()
         }
         Err(error) => refused(StatusCode::INTERNAL_SERVER_ERROR, format!("the simulation cannot start: {error}")),
     }
 }
 
-/// Ends the simulation of the recipe named `name`.
+/// Ends a simulation of the recipe named `name`.
 pub(crate) async fn end(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
     Path(name): Path<String>,
+    Query(of): Query<OfSimulation>,
     headers: HeaderMap,
 ) -> Response {
     let workbench = match permitted(&page, &session, &headers) {
         Ok(workbench) => workbench,
         Err(response) => return *response,
     };
-    workbench.simulation().take_if(|simulation| simulation.name == name);
+    workbench.simulation().take_if(|simulation| simulation.is(of.id, &name));
     StatusCode::NO_CONTENT.into_response()
 }
 
@@ -102,23 +111,25 @@ fn permitted<'p>(page: &'p Shared, session: &Session, headers: &HeaderMap) -> Re
 struct SimulationEvents {
     page: Shared,
     session: Session,
+    id: u64,
     name: String,
     language: Language,
     sent: Option<(String, bool)>,
 }
 
-/// Streams how the simulation of the recipe named `name` converges: pieces of HTML, sent only if they differ from the
-/// last ones. The stream ends with the simulation.
+/// Streams how a simulation of the recipe named `name` converges: pieces of HTML, sent only if they differ from the last
+/// ones. The stream ends with the simulation, and tells if another one has ended it.
 pub(crate) async fn events(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
     Path(name): Path<String>,
+    Query(of): Query<OfSimulation>,
     headers: HeaderMap,
 ) -> Response {
     if let Err(response) = for_engineer(&page, &session) {
         return *response;
     }
-    let looking = SimulationEvents { language: language(&headers), page, session, name, sent: None };
+    let looking = SimulationEvents { language: language(&headers), page, session, id: of.id, name, sent: None };
     Sse::new(unfold(looking, |mut looking| async {
         let event = looking.next().await?;
         Some((Ok::<_, Infallible>(event), looking))
@@ -147,16 +158,30 @@ impl SimulationEvents {
         }
     }
 
-    /// Returns the present HTML of the simulation, and true if it has ended. Returns `None` if there is none.
+    /// Returns the present HTML of the simulation, and true if it has ended. Returns `None` if the page has no workbench.
     fn current_pieces(&self) -> Option<(String, bool)> {
         let workbench = self.page.workbench.as_ref()?;
-        let simulation = workbench.simulation();
-        let simulation = simulation.as_ref().filter(|simulation| simulation.name == self.name)?;
+        let present = workbench.simulation();
+        let Some(simulation) = present.as_ref().filter(|simulation| simulation.is(self.id, &self.name)) else {
+            let by = present.as_ref().map(|later| later.task.person.as_str());
+            return Some((gone(by, &person_at(&self.session), self.language).into_string(), true));
+        };
         let ended = simulation.ended.borrow().clone();
         let seen = simulation.observed();
         // The record can be read a moment after the program has ended.
         let is_over = ended.as_ref().is_some_and(|ended| !ended.is_complete || verdict(&seen).is_some());
         Some((pieces(simulation, &seen, ended.as_ref(), self.language).into_string(), is_over))
+    }
+}
+
+/// Returns the HTML in place of a simulation that was ended. `by` is the person whose simulation has ended it, if there
+/// is one, and `own` the person at the browser.
+fn gone(by: Option<&str>, own: &str, language: Language) -> Markup {
+    html! {
+        p .quiet {
+            (WorkbenchText::SimulationEnded.to(language))
+            @if let Some(by) = by.filter(|by| *by != own) { " " (WorkbenchText::SimulationReplaced.to(language)) " " (by) }
+        }
     }
 }
 
@@ -171,10 +196,11 @@ fn pieces(simulation: &Simulation, seen: &ObservedRun, ended: Option<&EndedSimul
             @match (failed, verdict(seen)) {
                 (Some(_), _) => strong { (say(WorkbenchText::SimulationFailed)) },
                 (None, Some(true)) => strong .good { (say(WorkbenchText::Accepted)) },
-                (None, Some(false)) => strong { (say(WorkbenchText::NotAccepted)) },
+                (None, Some(false)) if summary.result == RunResult::NotAccepted => strong { (say(WorkbenchText::NotAccepted)) },
+                (None, Some(false)) => strong { (super::super::texts::result(summary.result).to(language)) },
                 (None, None) => span { (say(WorkbenchText::Simulates)) },
             }
-            " " span .quiet { (say(WorkbenchText::Seed)) " " (simulation.seed) }
+            " " span .quiet { (say(WorkbenchText::Seed)) " " (simulation.task.seed) }
         }
         @if let Some(failed) = failed { p .warns { (failed.message) } }
         @if !summary.cycles.is_empty() {
@@ -189,8 +215,9 @@ pub(crate) async fn map(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
     Path(name): Path<String>,
+    Query(of): Query<OfSimulation>,
 ) -> Response {
-    let found = of_run(&page, &session, &name, |folder, seen| {
+    let found = of_run(&page, &session, (of.id, &name), |folder, seen| {
         let map = folder.join(seen.summary.cycles.iter().rev().find_map(|cycle| cycle.map.clone())?);
         std::fs::read(map.parent()?.join(CycleFile::ErrorMapPng.name())).ok()
     });
@@ -205,10 +232,11 @@ pub(crate) async fn report(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
     Path(name): Path<String>,
+    Query(of): Query<OfSimulation>,
     headers: HeaderMap,
 ) -> Response {
     let language = language(&headers);
-    let found = of_run(&page, &session, &name, move |folder, _| {
+    let found = of_run(&page, &session, (of.id, &name), move |folder, _| {
         regrind_report::run_report(folder, &ReportOptions { language, ..ReportOptions::default() }).ok()
     });
     match found.await {
@@ -220,17 +248,17 @@ pub(crate) async fn report(
 /// Reads from the folder of the run of a simulation without blocking other requests.
 ///
 /// # Errors
-/// Returns the response to the browser if there is no simulation of this recipe, or if `read` finds nothing.
+/// Returns the response to the browser if there is no such simulation of this recipe, or if `read` finds nothing.
 async fn of_run<T: Send + 'static>(
     page: &Shared,
     session: &Session,
-    name: &str,
+    (id, name): (u64, &str),
     read: impl FnOnce(&std::path::Path, &ObservedRun) -> Option<T> + Send + 'static,
 ) -> Result<T, Response> {
     let workbench = for_engineer(page, session).map_err(|response| *response)?;
     let found = {
         let simulation = workbench.simulation();
-        let simulation = simulation.as_ref().filter(|simulation| simulation.name == name);
+        let simulation = simulation.as_ref().filter(|simulation| simulation.is(id, name));
         simulation.and_then(|simulation| Some((simulation.run_folder()?, simulation.observed())))
     };
     let nothing = || refused(StatusCode::NOT_FOUND, "there is no such result of a simulation");

@@ -22,7 +22,7 @@ use super::super::shared::Shared;
 use super::super::subject::PageSubject;
 use super::super::texts::{self, Text};
 use super::super::view::{harmless, not_here, plain_document, workbench_document};
-use super::access::refused;
+use super::draft::person_at;
 use super::saving;
 use super::state::Workbench;
 use super::texts::WorkbenchText;
@@ -47,7 +47,7 @@ pub(crate) async fn list(
         Err(response) => return *response,
     };
     let mut last_runs = last_runs(&page).await;
-    let listed = saving::on_disk(workbench.recipes.clone(), move |recipes| {
+    let listed = saving::done(workbench.recipes.clone(), move |recipes| {
         let recipe = |name: String| {
             let last_version = recipes.versions(&name)?.pop();
             let last_run = last_runs.remove(stem(&name));
@@ -57,7 +57,7 @@ pub(crate) async fn list(
     });
     let main = match listed.await {
         Ok(listed) => recipe_list(workbench, &listed, language),
-        Err(response) => return response,
+        Err((status, reason)) => return failed(status, &reason, &session, language),
     };
     plain_document(Text::Recipes.to(language), &session, language, main)
 }
@@ -83,8 +83,18 @@ pub(crate) async fn open(
     let name = if name.ends_with(".toml") { name.to_owned() } else { format!("{name}.toml") };
     match workbench.recipes.file(&name) {
         Some(_) => Redirect::to(&format!("/recipes/{}", in_path(&name))).into_response(),
-        None => refused(StatusCode::BAD_REQUEST, FormatError::RecipeName { name }.to_string()),
+        None => {
+            let reason = FormatError::RecipeName { name }.to_string();
+            failed(StatusCode::BAD_REQUEST, &reason, &session, language(&headers))
+        }
     }
+}
+
+/// Returns the page that tells why a recipe is not shown.
+fn failed(status: StatusCode, reason: &str, session: &Session, language: Language) -> Response {
+    let title = Text::Recipes.to(language);
+    let main = html! { main .list { h1 { (title) } p .warns { (reason) } p { a href="/recipes" { (title) } } } };
+    (status, plain_document(title, session, language, main)).into_response()
 }
 
 /// Returns the workbench if the person of `session` may use it.
@@ -138,6 +148,7 @@ fn last_run_words(run: &RunSummary, language: Language) -> Markup {
     let result = texts::result(run.result).to(language);
     html! {
         a href=(format!("/runs/{}", in_path(&run.run))) { (result) }
+        @if run.simulation { " " span .simulation { "SIMULATION" } }
         " " span .quiet { (WorkbenchText::InCycles.to(language)) " " (run.cycles.len()) " · " (when(&run.began)) }
     }
 }
@@ -181,13 +192,19 @@ pub(crate) async fn recipe(
     }
     let of = name.clone();
     let read = move |recipes: &RecipeFolder| Ok((recipes.text(&of)?, recipes.versions(&of)?));
-    let (text, versions) = match saving::on_disk(workbench.recipes.clone(), read).await {
+    let (text, versions) = match saving::done(workbench.recipes.clone(), read).await {
         Ok(read) => read,
-        Err(response) => return response.into_response(),
+        Err((status, reason)) => return failed(status, &reason, &session, language),
     };
     let last_run = last_runs(&page).await.remove(stem(&name));
+    let simulated = {
+        let simulation = workbench.simulation();
+        let own = simulation.as_ref().filter(|of| of.task.name == name && of.task.person == person_at(&session));
+        own.map(|of| json!({ "id": of.task.id, "text": of.task.text, "seed": of.task.seed }))
+    };
     let data = json!({
-        "name": name, "text": text, "skeleton": workbench.programs.skeleton(), "versions": versions,
+        "name": name, "text": text, "simulated": simulated, "folder": workbench.recipes.path(),
+        "person": session.person.as_ref().map_or("", |person| &person.name), "skeleton": workbench.programs.skeleton(), "versions": versions,
         "language": language.tag(), "texts": script_texts(language),
     });
     let main = editor(&name, &versions, last_run.as_deref(), &data, language);
@@ -208,9 +225,12 @@ fn editor(
             div .subject {
                 h1 { (name) }
                 p .quiet {
-                    span #version { @if let Some(last) = versions.last() { (say(WorkbenchText::Version)) " " (last.version) } @else if data["text"].is_null() { (say(WorkbenchText::NotSaved)) } }
+                    span #version { (present_version(versions, data["text"].as_str(), language)) }
                     " " span #changed hidden { (say(WorkbenchText::IsChanged)) }
-                    @if let Some(run) = last_run { " · " (say(WorkbenchText::LastRun)) ": " (last_run_words(run, language)) }
+                    @if let Some(run) = last_run {
+                        @if data["text"].is_null() || !versions.is_empty() { " · " }
+                        (say(WorkbenchText::LastRun)) ": " (last_run_words(run, language))
+                    }
                 }
             }
             label .versions { (say(WorkbenchText::CompareWith)) " " select #compared { option value="" { "–" } option value="file" { (say(WorkbenchText::PresentFile)) } } }
@@ -249,8 +269,9 @@ fn editor(
                 section .card {
                     h2 { (say(WorkbenchText::Simulation)) }
                     div .row { label { (say(WorkbenchText::Seed)) " " input #seed type="number" min="0" max="4294967295" step="1" value="1"; } button #end-simulation type="button" hidden { (say(WorkbenchText::EndSimulation)) } }
-                    div #simulation { p .quiet { (say(WorkbenchText::NotSimulated)) } }
-                    figure #last-map hidden { img alt=(say(WorkbenchText::LastMap)) data-src=(of_file("simulation/map")); figcaption { a href=(of_file("simulation/report")) target="_blank" { (say(WorkbenchText::Report)) } } }
+                    p #earlier-text .warns role="status" hidden { (say(WorkbenchText::EarlierText)) }
+                    div #simulation tabindex="0" role="region" aria-label=(say(WorkbenchText::Simulation)) { p .quiet { (say(WorkbenchText::NotSimulated)) } }
+                    figure #last-map hidden { img alt=(say(WorkbenchText::LastMap)) data-src=(of_file("simulation/map")); figcaption { a href="" data-href=(of_file("simulation/report")) target="_blank" { (say(WorkbenchText::Report)) } } }
                 }
             }
         }
@@ -258,20 +279,65 @@ fn editor(
     }
 }
 
+/// Returns the number of the version that the file has, in words.
+fn present_version(versions: &[RecipeVersion], text: Option<&str>, language: Language) -> String {
+    let say = |text: WorkbenchText| text.to(language);
+    match (versions.last(), text) {
+        (_, None) => say(WorkbenchText::NotSaved).to_owned(),
+        (None, Some(_)) => String::new(),
+        (Some(last), Some(text)) if last.is_text(text) => format!("{} {}", say(WorkbenchText::Version), last.version),
+        (Some(_), Some(_)) => say(WorkbenchText::OtherProgram).to_owned(),
+    }
+}
+
+/// Texts that the scripts show, by the names that they use.
+const SCRIPT_TEXTS: &[(&str, WorkbenchText)] = &[
+    ("version", WorkbenchText::Version),
+    ("saved", WorkbenchText::Saved),
+    ("otherProgram", WorkbenchText::OtherProgram),
+    ("editor", WorkbenchText::EditorHelp),
+    ("noProblem", WorkbenchText::NoProblem),
+    ("problems", WorkbenchText::ProblemCount),
+    ("checks", WorkbenchText::Checks),
+    ("draftKept", WorkbenchText::DraftKept),
+    ("discardDraft", WorkbenchText::DiscardDraft),
+    ("targets", WorkbenchText::Targets),
+    ("tracks", WorkbenchText::Tracks),
+    ("everyNth", WorkbenchText::EveryNth),
+    ("heightsTimes", WorkbenchText::HeightsTimes),
+    ("scallops", WorkbenchText::ScallopHeight),
+    ("noPlan", WorkbenchText::NoPlan),
+    ("noAnswer", WorkbenchText::NoAnswer),
+    ("measuring", WorkbenchText::Measuring),
+    ("touches", WorkbenchText::TouchCount),
+    ("atLeastMinutes", WorkbenchText::AtLeastMinutes),
+    ("pass", WorkbenchText::Pass),
+    ("trackCount", WorkbenchText::TrackCount),
+    ("minutes", WorkbenchText::Minutes),
+    ("allPasses", WorkbenchText::AllPasses),
+    ("atMostCycles", WorkbenchText::AtMostCycles),
+    ("ofLimit", WorkbenchText::OfLimit),
+    ("wheelLoss", WorkbenchText::WheelLoss),
+    ("removed", WorkbenchText::Removed),
+    ("budget", WorkbenchText::Budget),
+    ("weak", WorkbenchText::Weak),
+    ("weakRemedy", WorkbenchText::WeakRemedy),
+    ("warning", WorkbenchText::Warning),
+    ("simulates", WorkbenchText::Simulates),
+    ("earlierText", WorkbenchText::EarlierText),
+    ("badSeed", WorkbenchText::BadSeed),
+    ("signedOut", WorkbenchText::SignedOut),
+    ("pageGone", WorkbenchText::PageGone),
+    ("draftOfOldFile", WorkbenchText::DraftOfOldFile),
+    ("hasProblems", WorkbenchText::HasProblems),
+    ("damaged", WorkbenchText::Damaged),
+    ("noDifference", WorkbenchText::NoDifference),
+    ("unchangedLines", WorkbenchText::UnchangedLines),
+    ("before", WorkbenchText::Before),
+    ("after", WorkbenchText::After),
+];
+
 /// Returns, as JSON, the texts in `language` that the scripts show.
 fn script_texts(language: Language) -> Value {
-    let say = |text: WorkbenchText| text.to(language);
-    json!({
-        "version": say(WorkbenchText::Version), "saved": say(WorkbenchText::Saved), "otherProgram": say(WorkbenchText::OtherProgram),
-        "editor": say(WorkbenchText::EditorHelp), "noProblem": say(WorkbenchText::NoProblem), "problems": say(WorkbenchText::ProblemCount), "checks": say(WorkbenchText::Checks),
-        "draftKept": say(WorkbenchText::DraftKept), "discardDraft": say(WorkbenchText::DiscardDraft),
-        "targets": say(WorkbenchText::Targets), "tracks": say(WorkbenchText::Tracks), "everyNth": say(WorkbenchText::EveryNth), "heightsTimes": say(WorkbenchText::HeightsTimes),
-        "scallops": say(WorkbenchText::ScallopHeight), "noPlan": say(WorkbenchText::NoPlan), "noAnswer": say(WorkbenchText::NoAnswer),
-        "measuring": say(WorkbenchText::Measuring), "touches": say(WorkbenchText::TouchCount), "atLeastMinutes": say(WorkbenchText::AtLeastMinutes),
-        "pass": say(WorkbenchText::Pass), "trackCount": say(WorkbenchText::TrackCount), "minutes": say(WorkbenchText::Minutes),
-        "allPasses": say(WorkbenchText::AllPasses), "atMostCycles": say(WorkbenchText::AtMostCycles), "ofLimit": say(WorkbenchText::OfLimit),
-        "wheelLoss": say(WorkbenchText::WheelLoss), "removed": say(WorkbenchText::Removed), "budget": say(WorkbenchText::Budget),
-        "weak": say(WorkbenchText::Weak), "weakRemedy": say(WorkbenchText::WeakRemedy), "warning": say(WorkbenchText::Warning),
-        "simulates": say(WorkbenchText::Simulates),
-    })
+    SCRIPT_TEXTS.iter().map(|(name, text)| ((*name).to_owned(), Value::from(text.to(language)))).collect()
 }

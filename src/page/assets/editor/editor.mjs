@@ -36,6 +36,8 @@ const theme = EditorView.theme({
   ".cm-completionInfo": { maxWidth: "24rem", padding: "6px 10px", whiteSpace: "normal" },
   ".cm-panels": { backgroundColor: "var(--panel)", color: "var(--ink)" },
   ".cm-textfield, .cm-button": { backgroundColor: "var(--ground)", color: "var(--ink)", backgroundImage: "none", border: "1px solid var(--quiet)" },
+  ".cm-collapsedLines": { color: "var(--quiet)", background: "var(--panel)" },
+  ".cm-collapsedLines:before, .cm-collapsedLines:after": { content: '"⋯"' },
   ".cm-changedLine": { backgroundColor: "color-mix(in srgb, var(--accent) 12%, transparent) !important" },
   ".cm-changedText": { background: "color-mix(in srgb, var(--accent) 35%, transparent) !important" },
 });
@@ -124,7 +126,7 @@ export function edit(host, { text, label, changed, complete, isReadOnly }) {
         EditorState.readOnly.of(Boolean(isReadOnly)),
         autocompletion({ override: [complete], activateOnTyping: true, icons: false }),
         keymap.of([...closeBracketsKeymap, ...defaultKeymap, ...historyKeymap, ...searchKeymap, ...completionKeymap]),
-        EditorView.contentAttributes.of({ "aria-label": label, spellcheck: "false" }),
+        EditorView.contentAttributes.of({ "aria-label": label, spellcheck: "false", tabindex: "0" }),
         EditorView.updateListener.of((update) => { if (update.docChanged) changed(update.state.doc.toString()); }),
       ],
     }),
@@ -144,8 +146,14 @@ export function edit(host, { text, label, changed, complete, isReadOnly }) {
   };
 }
 
-/** Shows two texts side by side in `host`, a shadow root. Lines without a change are folded. */
-export function compare(host, { before, after }) {
-  const side = (doc) => ({ doc, extensions: [...common(), EditorState.readOnly.of(true), EditorView.editable.of(false)] });
-  return new MergeView({ a: side(before), b: side(after), root: host, parent: host, collapseUnchanged: { margin: 3, minSize: 6 }, gutter: true });
+/** Shows two texts side by side in `host`, a shadow root, under `labels`. Lines without a change are folded: `unchanged` tells their number. */
+export function compare(host, { before, after, labels, unchanged }) {
+  const side = (doc, label) => ({
+    doc,
+    extensions: [
+      ...common(), EditorState.readOnly.of(true), EditorView.editable.of(false), EditorState.phrases.of({ "$ unchanged lines": unchanged }),
+      EditorView.contentAttributes.of({ "aria-label": label, tabindex: "0" }),
+    ],
+  });
+  return new MergeView({ a: side(before, labels[0]), b: side(after, labels[1]), root: host, parent: host, collapseUnchanged: { margin: 3, minSize: 6 }, gutter: true });
 }
