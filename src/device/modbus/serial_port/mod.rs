@@ -14,9 +14,9 @@ use super::parity::Parity;
 use names::names;
 
 #[cfg(unix)]
-use unix::is_there;
+use unix::{can_list, is_there};
 #[cfg(windows)]
-use windows::is_there;
+use windows::{can_list, is_there};
 
 /// Opens the serial port `device` with 8 data bits. `baud` is the speed in bit/s, and `stop_bits` is 1 or 2. While the
 /// port is open, no other program can open it.
@@ -39,7 +39,7 @@ pub(crate) fn missing(device: &str) -> Option<String> {
     if device.is_empty() || is_there(device) {
         return None;
     }
-    let names = names();
+    let names = if can_list() { names() } else { Vec::new() };
     let there = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
     Some(format!("the serial port {device} does not exist on this computer; the serial ports here: {there}"))
 }

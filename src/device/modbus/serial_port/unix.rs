@@ -6,3 +6,9 @@ use std::path::Path;
 pub(crate) fn is_there(device: &str) -> bool {
     Path::new(device).exists()
 }
+
+/// Returns true if the serial ports of this computer can be listed. On Linux they are in `/sys`, which a bare root or a
+/// container can lack; the library that lists them panics then.
+pub(super) fn can_list() -> bool {
+    cfg!(not(target_os = "linux")) || Path::new("/sys/class/tty").is_dir()
+}

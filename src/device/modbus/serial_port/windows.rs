@@ -7,3 +7,8 @@ pub(crate) fn is_there(device: &str) -> bool {
     let name = device.strip_prefix(r"\\.\").unwrap_or(device);
     names().iter().any(|there| there.eq_ignore_ascii_case(name))
 }
+
+/// Returns true: Windows always lists its serial ports.
+pub(super) fn can_list() -> bool {
+    true
+}
