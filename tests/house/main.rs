@@ -69,7 +69,7 @@ const CORE: [&str; 8] =
 
 /// Files that may name an operating system, with the code that is specific to it: twins with the same functions, and
 /// the code that chooses between them.
-const SYSTEMS: [&str; 16] = [
+const SYSTEMS: [&str; 17] = [
     "sim/wire/mod.rs",
     "sim/wire/pty.rs",
     "src/cli/outside/mod.rs",
@@ -79,6 +79,7 @@ const SYSTEMS: [&str; 16] = [
     "src/control/endpoint/unix.rs",
     "src/control/endpoint/windows.rs",
     "src/device/modbus/serial_port/mod.rs",
+    "src/device/modbus/serial_port/unix.rs",
     "src/formats/system/mod.rs",
     "src/formats/system/unix.rs",
     "src/formats/system/windows.rs",
