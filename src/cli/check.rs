@@ -167,10 +167,13 @@ pub(super) fn cell_notes(cell: &CellConfig) -> Vec<String> {
 
 /// Returns true if the file at `path` has one of the tables whose heads are in `heads`. In a file that is not correct
 /// TOML, a line that begins with the head counts as the table. Only the first MiB is read. Returns false if the file
-/// cannot be read.
+/// cannot be read, or is a pipe or a device, which has no kind and possibly no end.
 pub(super) fn has_table(path: &Path, heads: &[&str]) -> bool {
     const ENOUGH_BYTES: u64 = 1 << 20;
     let mut bytes = Vec::new();
+    if !path.metadata().is_ok_and(|there| there.is_file()) {
+        return false;
+    }
     let read = File::open(path).and_then(|file| file.take(ENOUGH_BYTES).read_to_end(&mut bytes));
     let text = String::from_utf8_lossy(&bytes);
     if let Ok(tables) = text.parse::<toml::Table>() {

@@ -59,9 +59,9 @@ enum Line<'a> {
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     outside::give_way_to_all();
+    outside::end_with_reader(FAULT.into());
     let mut text = String::new();
     // A longer text is a text with a problem, so one byte more than allowed is enough.
-    outside::end_with_reader(FAULT.into());
     io::stdin().take(RecipeFolder::MAX_BYTES + 1).read_to_string(&mut text).map_err(Failure::Terminal)?;
     let recipe = match checked(arguments, &text) {
         Ok(recipe) => recipe,

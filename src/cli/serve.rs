@@ -113,13 +113,14 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         );
         let page = page.map_err(taken)?.with_first_run(first_run.clone()).with_workbench(workbench);
         let viewers = page.viewers();
-        // A page that ends in order ends its simulation and deletes its folder.
-        let mut endings = super::outside::Endings::new().map_err(Failure::Terminal)?;
+        // A page that ends in order ends its simulation and deletes its folder. The page of a run has neither, and a signal
+        // ends it at once.
+        let mut endings = (!while_stdin).then(Endings::new).transpose().map_err(Failure::Terminal)?;
         super::print(&format!("page     {}\n", page.url()))?;
         tokio::select! {
             () = page.serve(listener) => {}
             ended = tokio::signal::ctrl_c(), if !while_stdin => ended.map_err(Failure::Terminal)?,
-            _ = endings.next(), if !while_stdin => {}
+            _ = async { endings.as_mut()?.next().await }, if !while_stdin => {}
             () = end_of_run(&viewers), if *while_stdin => {}
         }
         Ok(Outcome::Accepted)

@@ -7,7 +7,8 @@
 //! ```
 //!
 //! A text that another program has changed becomes a version of its own before it is replaced. A change in the moment of
-//! saving is noticed, and the file stays as that program wrote it. So no text is lost.
+//! saving is noticed, and the file stays as that program wrote it. So no text is lost. This moment remains where the
+//! system cannot exchange the names of two files (Windows, some network disks).
 //!
 //! Only recipes are read and written: files with a table `[part]`, in this folder. Other files beside them, such as cell
 //! files and lists of users, are refused, and so are links that lead out of the folder.
@@ -195,8 +196,7 @@ impl RecipeFolder {
         }
         ResultFolder::prepare(&folder)?.keep();
         let _lock = SavingLock::acquire(&folder)?;
-        delete_unfinished(&folder, ".");
-        delete_unfinished(&self.0, &format!(".{name}."));
+        delete_unfinished_versions(&folder);
         let present = self.text(name)?;
         let mut versions = self.versions(name)?;
         if let Some(last) = versions.last().filter(|last| last.is_text(text))
@@ -339,12 +339,13 @@ fn write_like(path: &Path, bytes: &[u8], like: &Path) -> Result<(), FormatError>
     draft.publish()
 }
 
-/// Deletes the temporary files that a killed program has left in a folder: their names begin with `prefix`.
-fn delete_unfinished(folder: &Path, prefix: &str) {
+/// Deletes the temporary files that a killed program has left in a folder of versions. Those beside the recipe stay:
+/// after a kill while two files exchange their names, one of them has the text of another program.
+fn delete_unfinished_versions(folder: &Path) {
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         let name = entry.file_name();
         let name = name.to_string_lossy();
-        if name.starts_with(prefix) && name.ends_with(".tmp") {
+        if name.starts_with('.') && name.ends_with(".tmp") {
             // It takes room, and does no other harm.
             let _ = fs::remove_file(entry.path());
         }

@@ -415,6 +415,12 @@ impl Session {
     pub(crate) fn is_engineer(&self) -> bool {
         self.person.as_ref().is_none_or(|person| person.role == PageRole::Engineer)
     }
+
+    /// Returns a text that is different for each person: the name of a person who has signed in, or else the secret of
+    /// the browser. It must not be shown.
+    pub(crate) fn key_of_person(&self) -> String {
+        self.person.as_ref().map_or_else(|| format!("session {}", self.id), |person| format!("person {}", person.name))
+    }
 }
 
 /// Access of a client.

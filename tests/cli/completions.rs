@@ -20,6 +20,8 @@ fn folder() -> TempDir {
     }
     fs::write(home.path().join("plant.toml"), "[plant]\ncell = \"cell-1\"\n").unwrap();
     fs::write(home.path().join("notes.txt"), "[part]\n").unwrap();
+    // Reading a pipe waits for its writer.
+    assert!(Command::new("mkfifo").arg(home.path().join("pipe.toml")).status().unwrap().success());
     home
 }
 

@@ -401,3 +401,17 @@ fn settings_and_components_are_shown() {
         assert!(components.contains(class), "{class}: {components}");
     }
 }
+
+/// The page that a run has started ends at once when a service is stopped, without waiting for its browsers.
+#[test]
+fn page_of_a_run_ends_by_a_signal() {
+    let home = tempfile::tempdir().unwrap();
+    std::fs::create_dir(home.path().join("runs")).unwrap();
+    let mut command = regrind(&["serve", "--while-stdin", "--listen", "127.0.0.1:0", "--runs", "runs"], home.path());
+    command.stdin(std::process::Stdio::piped());
+    let mut page = Running::new(command);
+    page.line("address of the page", |line| line.starts_with("page "));
+    page.signal("TERM");
+    // The signal itself ends it, so there is no exit code.
+    assert_eq!(page.end().0, -1);
+}

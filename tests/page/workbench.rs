@@ -281,6 +281,26 @@ fn simulation_that_holds_ends_with_its_alarm() {
     assert!(last["isOver"] == true && html.contains("the cell holds"), "{html}");
 }
 
+/// A page without users knows its browsers by secrets, which no other browser gets.
+#[test]
+fn replaced_simulation_tells_no_secret() {
+    let home = tempfile::tempdir().unwrap();
+    let (_page, url) = begin(home.path(), &[]);
+    let [first, second] = [(); 2].map(|()| Visitor::with_key(&url));
+    assert_ne!(first.cookies, second.cookies);
+    let text = std::fs::read_to_string(small_recipe(home.path(), 1.0)).unwrap();
+    let [earlier, later] = [&first, &second].map(|visitor| simulate(visitor, &text));
+    let last = last_event(&first, earlier);
+    let html = last["html"].as_str().unwrap();
+    assert!(last["isOver"] == true && html.contains("another browser"), "{html}");
+    let secrets = second.cookies.split("; ").filter_map(|cookie| cookie.split_once('=')).map(|(_, secret)| secret);
+    let shown = format!("{html}{}", first.get("/recipes/small.toml").text());
+    for secret in secrets {
+        assert!(!shown.contains(secret), "{shown}");
+    }
+    assert_eq!(post(&second, &of_simulation("end", later), &json!(null)).0, 204);
+}
+
 /// The list of users and the cell file can stand beside the recipes.
 #[test]
 fn other_files_are_not_read_or_written() {

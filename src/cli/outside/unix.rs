@@ -82,14 +82,16 @@ pub(crate) fn give_way(steps: i32) {
 /// Lowers the scheduling priority of this process below all others, if the system permits it, and limits its memory to a
 /// quarter of that of the computer. A process that a person started in a shell stays in the session of the shell.
 pub(crate) fn give_way_to_all() {
-    use rustix::process::{Resource, Rlimit, setrlimit};
+    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
     let memory = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
     let total_kb =
         memory.lines().find_map(|line| line.strip_prefix("MemTotal:")?.trim().strip_suffix(" kB")?.parse().ok());
     let limit =
         total_kb.map(|kb: u64| (kb << 10) / 4).map_or(MIN_MEMORY_BYTES, |quarter| quarter.max(MIN_MEMORY_BYTES));
-    // A limit that is lower already stays. When memory is short, the system ends this process first.
+    // A limit that is lower already stays.
+    let limit = getrlimit(Resource::Data).maximum.map_or(limit, |present| present.min(limit));
     let _ = setrlimit(Resource::Data, Rlimit { current: Some(limit), maximum: Some(limit) });
+    // When memory is short, the system ends this process first.
     let _ = tell_system("oom_score_adj", "1000");
     // Linux shares the processor between sessions first, and regards priorities only within a session. A process that
     // leads a process group cannot leave its session.
@@ -112,8 +114,15 @@ pub(crate) fn end_with_reader(code: i32) {
     std::thread::spawn(move || {
         let stdout = rustix::stdio::stdout();
         // Without a wish for events, a pipe tells only that its other end was closed.
-        while poll(&mut [PollFd::from_borrowed_fd(stdout, PollFlags::empty())], None).is_err() {}
-        std::process::exit(code)
+        let wait = || poll(&mut [PollFd::from_borrowed_fd(stdout, PollFlags::empty())], None);
+        let mut told = wait();
+        while told == Err(rustix::io::Errno::INTR) {
+            told = wait();
+        }
+        // A system that cannot tell it lets the process go on.
+        if told.is_ok() {
+            std::process::exit(code);
+        }
     });
 }
 

@@ -222,6 +222,7 @@ const regrindWorkbench = (() => {
       if (isChanged) draft.set({ text: now, base: onDisk });
       else draft.remove();
       setGood(false);
+      isSaveWished = false;
       markSimulation();
       element("problem-count").textContent = texts.checks;
       clearTimeout(checking);
@@ -244,7 +245,7 @@ const regrindWorkbench = (() => {
       try {
         const answer = await fetch(`${path}/draft`, { method: "POST", body: sent, headers: { "Content-Type": "text/plain" }, signal });
         if (answer.status === 503) {
-          // The texts of other people are checked: this one comes after them.
+          // Other texts are checked: this one comes after them.
           checking = setTimeout(check, 1000);
           return;
         }

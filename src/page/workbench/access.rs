@@ -16,6 +16,9 @@ struct Refusal {
     message: String,
 }
 
+/// Answer to a text that is longer than `RecipeFolder::MAX_BYTES`.
+pub(super) const TOO_LONG: &str = "the text of a recipe has at most 256 KiB";
+
 pub(super) fn refused(status: StatusCode, message: impl Into<String>) -> Response {
     (status, Json(Refusal { message: message.into() })).into_response()
 }

@@ -15,12 +15,12 @@ use regrind_formats::RecipeFolder;
 use serde::Deserialize;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::process::{Child, ChildStdout, Command};
-use tokio::sync::{OwnedSemaphorePermit, oneshot};
-use tokio::time::{Instant, sleep, timeout, timeout_at};
+use tokio::sync::OwnedSemaphorePermit;
+use tokio::time::{Instant, timeout, timeout_at};
 
 use super::super::guard::{Session, foreign_origin};
 use super::super::shared::Shared;
-use super::access::{for_engineer, refused};
+use super::access::{TOO_LONG, for_engineer, refused};
 use super::state::Workbench;
 
 /// Maximum duration of the check and plan of one text.
@@ -30,7 +30,7 @@ const MAX_ANSWER_BYTES: usize = 32 << 20;
 /// Size of a piece of the answer, in bytes.
 const PIECE_BYTES: usize = 64 << 10;
 
-/// Maximum time for which a text waits for the checks of others.
+/// Maximum time for which a text waits for the checks of other texts.
 const MAX_WAIT: Duration = Duration::from_secs(15);
 /// Maximum duration of the check of a text that is to be saved, without its plan.
 const MAX_CHECK_DURATION: Duration = Duration::from_secs(20);
@@ -38,39 +38,17 @@ const MAX_CHECK_DURATION: Duration = Duration::from_secs(20);
 /// Child program whose output goes to a browser. It ends when the browser has gone, because the value is dropped.
 struct Answer {
     _child: Child,
-    _permit: Option<OwnedSemaphorePermit>,
-    _draft: PersonalDraft,
-    /// Ends when the same person has sent a later text.
-    replaced: oneshot::Receiver<()>,
+    _permits: [OwnedSemaphorePermit; 2],
     output: ChildStdout,
     until: Instant,
     left_bytes: usize,
 }
 
-/// Draft of a person, registered until it is dropped.
-struct PersonalDraft {
-    page: Shared,
-    person: String,
-    number: u64,
-}
-
-impl Drop for PersonalDraft {
-    fn drop(&mut self) {
-        if let Some(workbench) = &self.page.workbench {
-            workbench.forget_draft(&self.person, self.number);
-        }
-    }
-}
-
 impl Answer {
-    /// Returns the next piece of the output; `None` at its end, at the time limit, at the size limit, and after a later
-    /// text of the same person.
+    /// Returns the next piece of the output; `None` at its end, at the time limit and at the size limit.
     async fn next(&mut self) -> Option<Bytes> {
         let mut piece = vec![0; PIECE_BYTES.min(self.left_bytes)];
-        let read = tokio::select! {
-            read = timeout_at(self.until, self.output.read(&mut piece)) => read.ok()?.ok()?,
-            _ = &mut self.replaced => return None,
-        };
+        let read = timeout_at(self.until, self.output.read(&mut piece)).await.ok()?.ok()?;
         piece.truncate(read);
         self.left_bytes -= read;
         (read > 0).then(|| piece.into())
@@ -78,8 +56,8 @@ impl Answer {
 }
 
 /// Checks and plans the text in `body` as the recipe named `name`. The response is the output of the child program:
-/// lines of JSON, each as soon as it is known. A browser that ends the connection ends the child program, and so does a
-/// later text of the same person.
+/// lines of JSON, each as soon as it is known. A browser that ends the connection ends the child program. A second text of
+/// the same person waits for the first, so one person cannot stop the checks of others.
 pub(crate) async fn draft(
     State(page): State<Shared>,
     Extension(session): Extension<Session>,
@@ -100,20 +78,20 @@ pub(crate) async fn draft(
         return refused(StatusCode::NOT_FOUND, "this is no name for a recipe");
     };
     if body.len() as u64 > RecipeFolder::MAX_BYTES {
-        return refused(StatusCode::PAYLOAD_TOO_LARGE, "the text of a recipe has at most 256 KiB");
+        return refused(StatusCode::PAYLOAD_TOO_LARGE, TOO_LONG);
     }
-    let draft = PersonalDraft { page: page.clone(), person: person_at(&session), number: workbench.next_number() };
-    let mut replaced = workbench.begin_draft(&draft.person, draft.number);
-    let permit = tokio::select! {
-        permit = Arc::clone(&workbench.drafts).acquire_owned() => permit.ok(),
-        _ = &mut replaced => return refused(StatusCode::CONFLICT, "a later text of the same person is checked"),
-        () = sleep(MAX_WAIT) => return refused(StatusCode::SERVICE_UNAVAILABLE, "the texts of other people are checked; wait a moment"),
+    let (own_turn, of_all) = (workbench.turn_of(&session.key_of_person()), Arc::clone(&workbench.drafts));
+    let permits =
+        timeout(
+            MAX_WAIT,
+            async move { Some([own_turn.acquire_owned().await.ok()?, of_all.acquire_owned().await.ok()?]) },
+        );
+    let Ok(Some(permits)) = permits.await else {
+        return refused(StatusCode::SERVICE_UNAVAILABLE, "other texts are checked; wait a moment");
     };
     let started = started(workbench.programs.draft(&path).into(), body).map(|(child, output)| Answer {
         _child: child,
-        _permit: permit,
-        _draft: draft,
-        replaced,
+        _permits: permits,
         output,
         until: Instant::now() + MAX_DURATION,
         left_bytes: MAX_ANSWER_BYTES,
@@ -132,11 +110,6 @@ pub(crate) async fn draft(
 
 fn cannot_start(error: &std::io::Error) -> String {
     format!("the program that checks recipes cannot start: {error}")
-}
-
-/// Returns the person at a browser: the name of a person who has signed in, or else the session.
-pub(super) fn person_at(session: &Session) -> String {
-    session.person.as_ref().map_or_else(|| session.id.clone(), |person| person.name.clone())
 }
 
 /// Checks a text that is to be saved as the recipe at `path`, without its plan.

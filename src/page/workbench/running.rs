@@ -15,6 +15,7 @@ use tokio::time::{Instant, sleep};
 
 use super::super::history::History;
 use super::super::live::{ObservedRun, RunWatcher};
+use super::super::users::Person;
 
 /// Maximum size of the messages of the child program that are kept, in bytes.
 const MAX_MESSAGE_BYTES: u64 = 4096;
@@ -31,8 +32,10 @@ pub(super) struct SimulationTask {
     pub(super) name: String,
     pub(super) text: String,
     pub(super) seed: u64,
-    /// Person who has started it: a name, or the session of a browser with the key of the page.
-    pub(super) person: String,
+    /// Person who has started it; `None` on a page without users.
+    pub(super) person: Option<Person>,
+    /// Key of the person, which must not be shown.
+    pub(super) person_key: String,
 }
 
 /// Run on simulated machines, and the child program that drives it.

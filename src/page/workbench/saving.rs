@@ -12,7 +12,7 @@ use tokio::task::spawn_blocking;
 
 use super::super::guard::{Session, foreign};
 use super::super::shared::Shared;
-use super::access::{for_engineer, plain, refused};
+use super::access::{TOO_LONG, for_engineer, plain, refused};
 use super::draft::checked;
 
 /// Text that a browser saves.
@@ -48,7 +48,7 @@ pub(crate) async fn save(
         return refused(StatusCode::BAD_REQUEST, FormatError::RecipeName { name }.to_string());
     };
     if text.len() as u64 > RecipeFolder::MAX_BYTES {
-        return refused(StatusCode::PAYLOAD_TOO_LARGE, "the text of a recipe has at most 256 KiB");
+        return refused(StatusCode::PAYLOAD_TOO_LARGE, TOO_LONG);
     }
     let _saving = workbench.saving.lock().await;
     if let Err(response) = checked(workbench, &path, &text).await {
@@ -128,14 +128,14 @@ pub(super) async fn on_disk<T: Send + 'static>(
     recipes: RecipeFolder,
     work: impl FnOnce(&RecipeFolder) -> Result<T, FormatError> + Send + 'static,
 ) -> Result<T, Response> {
-    done(recipes, work).await.map_err(|(status, reason)| refused(status, reason))
+    with_recipes(recipes, work).await.map_err(|(status, reason)| refused(status, reason))
 }
 
 /// Works with the folder of recipes without blocking other requests.
 ///
 /// # Errors
 /// Returns the status of the response, and the reason.
-pub(super) async fn done<T: Send + 'static>(
+pub(super) async fn with_recipes<T: Send + 'static>(
     recipes: RecipeFolder,
     work: impl FnOnce(&RecipeFolder) -> Result<T, FormatError> + Send + 'static,
 ) -> Result<T, (StatusCode, String)> {

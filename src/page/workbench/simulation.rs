@@ -27,7 +27,6 @@ use super::super::pieces::figures;
 use super::super::reader::language;
 use super::super::shared::Shared;
 use super::access::{for_engineer, refused};
-use super::draft::person_at;
 use super::running::{EndedSimulation, LOOK_EVERY, Simulation, SimulationTask, started};
 use super::state::Workbench;
 use super::texts::WorkbenchText;
@@ -73,7 +72,8 @@ pub(crate) async fn begin(
     };
     let command = workbench.programs.simulation(&recipe, &folder.draft(), &folder.runs(), seed);
     let id = workbench.next_number();
-    let task = SimulationTask { id, name, text, seed, person: person_at(&session) };
+    let task =
+        SimulationTask { id, name, text, seed, person: session.person.clone(), person_key: session.key_of_person() };
     match started(command.into(), task, folder) {
         Ok(simulation) => {
             *workbench.simulation() = Some(simulation);
@@ -163,8 +163,8 @@ impl SimulationEvents {
         let workbench = self.page.workbench.as_ref()?;
         let present = workbench.simulation();
         let Some(simulation) = present.as_ref().filter(|simulation| simulation.is(self.id, &self.name)) else {
-            let by = present.as_ref().map(|later| later.task.person.as_str());
-            return Some((gone(by, &person_at(&self.session), self.language).into_string(), true));
+            let others = present.as_ref().filter(|later| later.task.person_key != self.session.key_of_person());
+            return Some((gone(others, self.language).into_string(), true));
         };
         let ended = simulation.ended.borrow().clone();
         let seen = simulation.observed();
@@ -174,13 +174,16 @@ impl SimulationEvents {
     }
 }
 
-/// Returns the HTML in place of a simulation that was ended. `by` is the person whose simulation has ended it, if there
-/// is one, and `own` the person at the browser.
-fn gone(by: Option<&str>, own: &str, language: Language) -> Markup {
+/// Returns the HTML in place of a simulation that was ended. `replaced_by` is the simulation of another person that has
+/// ended it, if there is one.
+fn gone(replaced_by: Option<&Simulation>, language: Language) -> Markup {
+    let say = |text: WorkbenchText| text.to(language);
     html! {
         p .quiet {
-            (WorkbenchText::SimulationEnded.to(language))
-            @if let Some(by) = by.filter(|by| *by != own) { " " (WorkbenchText::SimulationReplaced.to(language)) " " (by) }
+            (say(WorkbenchText::SimulationEnded))
+            @if let Some(later) = replaced_by {
+                " " (say(WorkbenchText::SimulationReplaced)) " " (later.task.person.as_ref().map_or(say(WorkbenchText::OtherBrowser), |person| &person.name))
+            }
         }
     }
 }

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use regrind_formats::RecipeFolder;
 use serde_json::Value;
-use tokio::sync::{Semaphore, oneshot};
+use tokio::sync::Semaphore;
 
 use super::running::Simulation;
 
@@ -37,8 +37,8 @@ pub struct Workbench {
     pub(super) recipes: RecipeFolder,
     pub(super) programs: Box<dyn RecipePrograms>,
     pub(super) drafts: Arc<Semaphore>,
-    /// Draft of each person that is being checked: its number, and what ends it when it is dropped.
-    personal_drafts: Mutex<HashMap<String, (u64, oneshot::Sender<()>)>>,
+    /// For each person at a browser, one permit: one text of a person is checked at a time.
+    turns: Mutex<HashMap<String, Arc<Semaphore>>>,
     /// Held while a recipe is saved, so that waiting saves occupy no threads.
     pub(super) saving: tokio::sync::Mutex<()>,
     /// Last simulation that a browser has started; it ends when the next one begins.
@@ -53,7 +53,7 @@ impl Workbench {
             recipes,
             programs,
             drafts: Arc::new(Semaphore::new(MAX_DRAFTS)),
-            personal_drafts: Mutex::default(),
+            turns: Mutex::default(),
             saving: tokio::sync::Mutex::default(),
             simulation: Mutex::default(),
             last_number: AtomicU64::new(0),
@@ -70,23 +70,49 @@ impl Workbench {
         self.simulation.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Registers the draft number `number` as the one of a person, and ends the draft of this person before. The returned
-    /// receiver tells the end by a later draft.
-    pub(super) fn begin_draft(&self, person: &str, number: u64) -> oneshot::Receiver<()> {
-        let (end, ended) = oneshot::channel();
-        self.personal_drafts().insert(person.to_owned(), (number, end));
-        ended
+    /// Returns the permit of a person: the text of its holder is the only one of this person that is checked.
+    pub(super) fn turn_of(&self, person: &str) -> Arc<Semaphore> {
+        let mut turns = self.turns.lock().unwrap_or_else(PoisonError::into_inner);
+        // Nobody uses the permits that are known only here.
+        turns.retain(|_, turn| Arc::strong_count(turn) > 1);
+        Arc::clone(turns.entry(person.to_owned()).or_insert_with(|| Arc::new(Semaphore::new(1))))
     }
+}
 
-    /// Forgets the draft number `number` of a person, if no later one has replaced it.
-    pub(super) fn forget_draft(&self, person: &str, number: u64) {
-        let mut drafts = self.personal_drafts();
-        if drafts.get(person).is_some_and(|(present, _)| *present == number) {
-            drafts.remove(person);
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct NoPrograms;
+
+    impl RecipePrograms for NoPrograms {
+        fn draft(&self, _recipe: &Path) -> Command {
+            Command::new("false")
+        }
+
+        fn simulation(&self, _recipe: &Path, _draft: &Path, _runs: &Path, _seed: u64) -> Command {
+            Command::new("false")
+        }
+
+        fn schema(&self) -> &Value {
+            &Value::Null
+        }
+
+        fn skeleton(&self) -> &str {
+            ""
         }
     }
 
-    fn personal_drafts(&self) -> MutexGuard<'_, HashMap<String, (u64, oneshot::Sender<()>)>> {
-        self.personal_drafts.lock().unwrap_or_else(PoisonError::into_inner)
+    #[test]
+    fn one_text_of_a_person_is_checked_at_a_time() {
+        let workbench = Workbench::new(RecipeFolder::at("recipes"), Box::new(NoPrograms));
+        let first = workbench.turn_of("A. Smith").try_acquire_owned().unwrap();
+        assert!(workbench.turn_of("A. Smith").try_acquire_owned().is_err());
+        assert!(workbench.turn_of("B. Jones").try_acquire_owned().is_ok());
+        drop(first);
+        assert!(workbench.turn_of("A. Smith").try_acquire_owned().is_ok());
+        // People who check nothing are not kept.
+        drop(workbench.turn_of("C. Brown"));
+        assert_eq!(workbench.turns.lock().unwrap().len(), 1);
     }
 }

@@ -12,7 +12,7 @@ regrind_language::texts! {
     Plan NoPlan NoAnswer Measuring TouchCount AtLeastMinutes Pass TrackCount Minutes AllPasses AtMostCycles ScallopHeight OfLimit
     WheelLoss Removed Budget Weak WeakRemedy Warning
     Simulation NotSimulated Seed Simulates SimulationFailed Accepted NotAccepted LastMap Report
-    SimulationEnded SimulationReplaced EarlierText BadSeed SignedOut PageGone DraftOfOldFile HasProblems Damaged NoDifference
+    SimulationEnded SimulationReplaced OtherBrowser EarlierText BadSeed SignedOut PageGone DraftOfOldFile HasProblems Damaged NoDifference
     UnchangedLines Before After
 }
 

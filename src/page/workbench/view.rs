@@ -22,7 +22,6 @@ use super::super::shared::Shared;
 use super::super::subject::PageSubject;
 use super::super::texts::{self, Text};
 use super::super::view::{harmless, not_here, plain_document, workbench_document};
-use super::draft::person_at;
 use super::saving;
 use super::state::Workbench;
 use super::texts::WorkbenchText;
@@ -47,7 +46,7 @@ pub(crate) async fn list(
         Err(response) => return *response,
     };
     let mut last_runs = last_runs(&page).await;
-    let listed = saving::done(workbench.recipes.clone(), move |recipes| {
+    let listed = saving::with_recipes(workbench.recipes.clone(), move |recipes| {
         let recipe = |name: String| {
             let last_version = recipes.versions(&name)?.pop();
             let last_run = last_runs.remove(stem(&name));
@@ -192,18 +191,19 @@ pub(crate) async fn recipe(
     }
     let of = name.clone();
     let read = move |recipes: &RecipeFolder| Ok((recipes.text(&of)?, recipes.versions(&of)?));
-    let (text, versions) = match saving::done(workbench.recipes.clone(), read).await {
+    let (text, versions) = match saving::with_recipes(workbench.recipes.clone(), read).await {
         Ok(read) => read,
         Err((status, reason)) => return failed(status, &reason, &session, language),
     };
     let last_run = last_runs(&page).await.remove(stem(&name));
     let simulated = {
         let simulation = workbench.simulation();
-        let own = simulation.as_ref().filter(|of| of.task.name == name && of.task.person == person_at(&session));
+        let own =
+            simulation.as_ref().filter(|of| of.task.name == name && of.task.person_key == session.key_of_person());
         own.map(|of| json!({ "id": of.task.id, "text": of.task.text, "seed": of.task.seed }))
     };
     let data = json!({
-        "name": name, "text": text, "simulated": simulated, "folder": workbench.recipes.path(),
+        "name": name, "text": text, "simulated": simulated, "folder": workbench.recipes.path().display().to_string(),
         "person": session.person.as_ref().map_or("", |person| &person.name), "skeleton": workbench.programs.skeleton(), "versions": versions,
         "language": language.tag(), "texts": script_texts(language),
     });
